@@ -159,16 +159,16 @@ def plan_growth(
     least: Array | int = 0,
     draw: DrawHosts | None = None,
 ) -> Moves:
-    """Plan what `grow` does to rows of these opacities [N], of which the first `num_live` exist, to at least `least`
-    where the cap allows it. Hosts are drawn as in `plan_relocation`."""
+    """Plan what `grow` does to rows of these opacities [N], of which the first `num_live` exist. It grows to at least
+    `least`, within the cap. Hosts are drawn as in `plan_relocation`."""
     index = jnp.arange(opacities.shape[0], dtype=jnp.int32)
     is_live = index < num_live
     is_host = is_live & (opacities > DEAD_OPACITY)
     has_hosts = jnp.any(is_host)
     # n + ⌊n/20⌋ is ⌊1.05·n⌋ in integers, free of rounding.
-    wanted = jnp.maximum(jnp.maximum(num_live + 1, num_live + num_live // 20), jnp.asarray(least, jnp.int32))
-    wanted = jnp.minimum(jnp.asarray(cap, jnp.int32), wanted)
-    grown = jnp.where(has_hosts, jnp.maximum(wanted, num_live), num_live)
+    grown = jnp.maximum(jnp.maximum(num_live + 1, num_live + num_live // 20), jnp.asarray(least, jnp.int32))
+    grown = jnp.minimum(jnp.asarray(cap, jnp.int32), grown)
+    grown = jnp.where(has_hosts, jnp.maximum(grown, num_live), num_live)
     is_added = ~is_live & (index < grown)
     hosts = draw_hosts(key, opacities, is_host) if draw is None else draw(key, is_host, is_added)
     rows, num_draws = _copied_rows(hosts, is_added)
@@ -267,7 +267,7 @@ def _moved(gaussians: Gaussians, moments: Any, num_live: Array, moves: Moves) ->
     """Copy rows from their hosts after sharing, and clear their moments."""
     logits, scales = share(gaussians.logit_opacities, gaussians.log_scales, moves.num_shares)
     copied = dataclasses.replace(gaussians, logit_opacities=logits, log_scales=scales)[moves.rows]
-    # Of the leaves, only the number of Adam's updates has no rows.
+    # The only leaf without rows is the number of Adam's updates.
     moments = jax.tree.map(
         lambda x: jnp.where(moves.is_reset.reshape(-1, *[1] * (x.ndim - 1)), jnp.zeros_like(x), x) if x.ndim else x,
         moments,
@@ -382,7 +382,7 @@ class Mcmc(StepEvent):
 
 @pytree
 class FillingMcmc(Mcmc):
-    """Variant of `Mcmc` that grows by more than 5 % if it takes that to reach the cap by its last event."""
+    """Variant of `Mcmc` that grows by more than 5 % where that is needed to reach the cap by its last event."""
 
     def check_options(self) -> None:
         check_number("cap", self.cap, least=2)

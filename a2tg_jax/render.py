@@ -144,7 +144,7 @@ class _Watched(NamedTuple):
 def _watch(rendered: _Watched, kind: Hashable) -> None:
     """Warn if this eager render, or one before it that is done by now, has overflowed or is empty.
 
-    The first render of a kind (settings, image size and number of Gaussians) is waited for; later ones are read once
+    It waits for the first render of a kind (settings, image size and number of Gaussians). Later ones are read once
     they are done, so that rendering stays asynchronous.
     """
     with _watch_lock:
@@ -157,7 +157,7 @@ def _watch(rendered: _Watched, kind: Hashable) -> None:
             if not _pending or not (_pending[0].num_pairs.is_deleted() or _pending[0].num_pairs.is_ready()):
                 return
             done = _pending.popleft()
-        # What is deleted has no value to read.
+        # Deleted arrays have no values.
         if done.num_pairs.is_deleted() or done.overflow.is_deleted():
             continue
         # Explicit transfers, which `jax.transfer_guard` lets pass.
@@ -186,8 +186,8 @@ def with_features(appearance: Appearance, features: ArrayLike | None, gaussians:
     features = plain_array("features", features, gaussians.means.dtype)
     check_floats("features", features, (gaussians.num, "D"))
     if dtype_of(features) != gaussians.means.dtype or not np.shape(features)[1]:
-        found = f"{dtype_of(features)}{[*np.shape(features)]}"
-        raise ValueError(f"features must be {gaussians.means.dtype} as the means are, D >= 1; got {found}")
+        got = f"{dtype_of(features)}{[*np.shape(features)]}"
+        raise ValueError(f"features must be {gaussians.means.dtype} as the means are, D >= 1; got {got}")
     return dataclasses.replace(appearance, features=jnp.asarray(features))
 
 

@@ -59,8 +59,10 @@ Shading = tuple[Residual, Factor] | tuple[Residual, Factor, Tint]
 # stores textures, `core.bilinear` interpolates them. The renderer gets all of them one after the other as texels
 # [T, 4], each row by row.
 
-LEAST_EXTENT, MOST_EXTENT = 1e-3, 1e3
-"""Range of half the side of a texture: float32 keeps lookups exact in it, and no kernel is as wide as its end."""
+LEAST_EXTENT = 1e-3
+"""Least half side of a texture, for which float32 still keeps lookups exact."""
+MOST_EXTENT = 1e3
+"""Largest half side of a texture, wider than any kernel."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,8 +144,8 @@ class Texture(Part):
 
     def project(self) -> "Texture":
         """Return textures with alpha factors clamped to [0, 1], and RGB as well if it is unsigned."""
-        # What `shown` would clip is clipped here as well, which changes no image: beyond the bounds, where gradients
-        # are 0, texels would stay forever. Alpha that is divided by its maximum has no upper bound.
+        # Clips what `shown` clips, which changes no image: gradients are 0 beyond the bounds, and texels could not
+        # return. Alpha that is divided by its maximum has no upper bound.
         options = self.options
         most_alpha = jnp.inf if options.alpha == "global-maximum" else 1.0
         least, most = (0.0, 1.0) if options.rgb == "unit" else (-jnp.inf, jnp.inf)
@@ -199,11 +201,11 @@ class Texture(Part):
         most = max(map(len, textures.buckets))
         columns = []
         for bucket in textures.buckets:  # 1 of an empty texture, 0 past the capacity.
-            own = jnp.max(bucket[..., 3], axis=(1, 2)) if bucket.size else jnp.ones(most, bucket.dtype)
-            columns.append(jnp.pad(own, (0, most - len(own))))
+            largest = jnp.max(bucket[..., 3], axis=(1, 2)) if bucket.size else jnp.ones(most, bucket.dtype)
+            columns.append(jnp.pad(largest, (0, most - len(largest))))
         peaks = jnp.stack(columns)
         peaks = jax.lax.stop_gradient(peaks[textures.bucket, textures.row])
-        # Outside such a texture the factor is 1.
+        # Outside a texture with this option the factor is 1.
         return jnp.maximum(peaks, 1.0) if self.options.outside == "identity" else peaks
 
     # Element-wise, without the texels
@@ -266,8 +268,8 @@ class Exponents(Part):
 
     def check(self, gaussians: Gaussians) -> None:
         if self.shapes is None or self.shapes.shape != (gaussians.num,):
-            found = None if self.shapes is None else list(self.shapes.shape)
-            raise ValueError(f"shapes must be [{gaussians.num}], one for each Gaussian; got {found}")
+            shape = None if self.shapes is None else list(self.shapes.shape)
+            raise ValueError(f"shapes must be [{gaussians.num}], one for each Gaussian; got {shape}")
 
 
 class Curve(NamedTuple):
@@ -337,9 +339,9 @@ class Coefficients(Table):
         owners = []
         for index, blocks in enumerate(buckets):
             # N is out of range, so that scatters drop padding.
-            own = np.full(len(blocks), num, np.int32)
-            own[row[bucket == index]] = np.flatnonzero(bucket == index)
-            owners.append(jax.device_put(own))
+            owner = np.full(len(blocks), num, np.int32)
+            owner[row[bucket == index]] = np.flatnonzero(bucket == index)
+            owners.append(jax.device_put(owner))
         return dataclasses.replace(super().placed(buckets, places), owners=tuple(owners))
 
     @staticmethod
@@ -365,7 +367,8 @@ class Bands(Part):
         check_table(self.coefficients, gaussians.num, "bands.coefficients")
         check_places(self.coefficients, "bands.coefficients")
         possible = {number - NUM_BASES[gaussians.sh_degree] for number in NUM_BASES[gaussians.sh_degree :]}
-        if unknown := {size for (size,) in self.coefficients.bucket_sizes} - possible:
+        unknown = {size for (size,) in self.coefficients.bucket_sizes} - possible
+        if unknown:
             raise ValueError(
                 f"bands.coefficients have blocks of {min(unknown)} coefficients, which no degree above "
                 f"{gaussians.sh_degree}, the degree of the Gaussians, has"
@@ -395,8 +398,8 @@ class Bands(Part):
                 if blocks.shape[1] < last - NUM_BASES[base]:
                     break
                 basis = jnp.where(jnp.asarray(degree) >= band, bases[:, first:last], 0.0)
-                own = blocks[:, first - NUM_BASES[base] : last - NUM_BASES[base]]
-                colors = colors + jnp.sum(basis[:, :, None] * own, axis=1)
+                coefficients = blocks[:, first - NUM_BASES[base] : last - NUM_BASES[base]]
+                colors = colors + jnp.sum(basis[:, :, None] * coefficients, axis=1)
             total = total.at[owners].add(colors, mode="drop")
         return total
 
@@ -451,18 +454,19 @@ NUM_SCALES = 121
 NUM_PLACES = 2001
 LARGEST_PLACE = 12.0
 """Distance, in standard deviations, up to which kernels are compared."""
-LEAST_LOG_SCALE, MOST_LOG_SCALE = -0.3, 0.9
-"""Range of the logarithms of √k."""
+LEAST_LOG_SCALE = -0.3
+"""Least logarithm of √k."""
+MOST_LOG_SCALE = 0.9
 
 
 def nearest_gaussians(gaussians: Gaussians, shapes: np.ndarray) -> Gaussians:
     """Return the Gaussians nearest to kernels of the given shapes [N]: other scales and opacities (host)."""
-    log_exponents, peaks, log_scales = _table()
-    own = log_exponents_of(shapes)
-    opacities = np.asarray(gaussians.opacities, np.float64) * np.interp(own, log_exponents, peaks)
+    tabulated, peaks, log_scales = _table()
+    log_exponents = log_exponents_of(shapes)
+    opacities = np.asarray(gaussians.opacities, np.float64) * np.interp(log_exponents, tabulated, peaks)
     dtype = gaussians.means.dtype
     limited = jnp.asarray(np.clip(opacities, LEAST_OPACITY, LARGEST_OPACITY), dtype)
-    larger = np.asarray(gaussians.log_scales) + np.interp(own, log_exponents, log_scales)[:, None]
+    larger = np.asarray(gaussians.log_scales) + np.interp(log_exponents, tabulated, log_scales)[:, None]
     return dataclasses.replace(gaussians, logit_opacities=logit(limited), log_scales=jnp.asarray(larger, dtype))
 
 

@@ -30,8 +30,8 @@ Floats = Array | np.ndarray
 def fibonacci(num: int, turn: float = 0.0) -> np.ndarray:
     """Return unit vectors [num, 3] spread evenly over the sphere, a Fibonacci lattice, turned by radians about z."""
     index = np.arange(num) + 0.5
-    # 2π times the golden ratio
     z = 1 - 2 * index / num
+    # π·(1 + √5) is 2π times the golden ratio.
     angle = np.pi * (1 + 5**0.5) * index + turn
     across = np.sqrt(1 - z * z)
     return np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)
@@ -97,7 +97,7 @@ def screen_bounds(M: Array, cutoff: Array, near_plane: float) -> ScreenBounds:
     The cutoff [N] is r² = 2·ln(255·o·max T_A); a splat with r² <= 0 is invisible. Hits have depths from `near_plane`
     on.
     """
-    # The box is found for both cases, since one branch for all splats would have to be the slow one.
+    # Both boxes are computed for all splats: a branch would be the slow one as soon as one splat needs it.
     rows = tuple(tuple(M[:, i, k] for k in range(3)) for i in range(3))
     bounds = unclipped_bounds(rows, cutoff, near_plane)
     clipped = clipped_box(rows, bounds.outline, cutoff, near_plane)

@@ -37,7 +37,7 @@ def relative_difference(results: Sequence[ArrayLike], references: Sequence[Array
 
 
 def factor_to(most: float, columns: Sequence[Array]) -> Array:
-    """Return the factor [N] by which the largest magnitude of a row of columns [N] becomes `most`, or 1 if it is smaller.
+    """Return the factor [N] by which the largest magnitude of a row of columns [N] becomes `most`; 1 if it is smaller.
     It has no gradient."""
     largest = functools.reduce(jnp.maximum, (jnp.abs(jax.lax.stop_gradient(column)) for column in columns))
     return jnp.where(largest > most, most / largest, 1.0)

@@ -186,8 +186,8 @@ def num_compiled(jitted: Any) -> int:
     return int(jitted._cache_size())  # JAX has no public counterpart
 
 
-# Training differentiates and changes the floats of a pytree. `jax.grad` rejects the rest, integers such as the places of
-# textures, so `partition` splits them.
+# Training differentiates and changes the floats of a pytree. `partition` separates them from the rest, integers such as
+# the places of textures, which `jax.grad` rejects.
 #
 #     floats, rest = partition(model)
 #     gradient = jax.grad(lambda floats: loss(combine(floats, rest)))(floats)

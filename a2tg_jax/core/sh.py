@@ -51,7 +51,7 @@ def sh_basis(directions: Array, num: int = 16) -> Array:
 def directions_from(center: Array, means: Array) -> Array:
     """Return the unit vectors [N, 3] from a camera's centre [3] to means [N, 3] at any distance."""
     offsets = means - center[None, :]
-    # Otherwise squares would overflow far away, and gradients be NaN.
+    # Far away, squares would overflow and gradients be NaN.
     return normalize(offsets * factor_to(LARGEST_NUMBER, [*offsets.T])[:, None])
 
 

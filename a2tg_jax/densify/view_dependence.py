@@ -84,7 +84,7 @@ class AdaptDegrees(HostEvent):
         return iterations_at(self.at, num_iterations)
 
     def num_programs(self, num_iterations: int) -> int:
-        return 0  # Tables have room, unless degrees may take more than half of the budget.
+        return 0  # `with_room` has made room, unless degrees may take more than half of the budget.
 
     def most_bytes(self, num_bytes: float, num: int, num_iterations: int) -> float:
         of_bands = BYTES_PER_FLOAT * 3 * NUM_BASES[self.highest] * num

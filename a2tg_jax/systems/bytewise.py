@@ -176,11 +176,12 @@ class Bytewise(TwoStages):
                 f"already: set it so, or lower base_degree; got {self.view_dependence_share}"
             )
         shares = {"view_dependence": self.view_dependence_share, "details": self.texture_share}
-        times = {
-            path: getattr(self, path).iterations(self.stage2_iterations) for path, share in shares.items() if share
-        }
-        for path, found in times.items():
-            if not found:
+        times = {}
+        for path, share in shares.items():
+            if share:
+                times[path] = getattr(self, path).iterations(self.stage2_iterations)
+        for path, iterations in times.items():
+            if not iterations:
                 raise ValueError(f"{path}.at must hold fractions at which its share of the bytes is spent; it is empty")
         if len(times) == 2 and times["view_dependence"][-1] > times["details"][0]:
             raise ValueError(

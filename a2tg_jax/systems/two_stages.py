@@ -67,10 +67,10 @@ class TwoStages(System):
         floaters = self.floaters
         length = self.stage1_iterations
         if floaters.min_views or floaters.near:
-            growing = (each for each in events if isinstance(each, StepEvent) and each.most_gaussians is not None)
-            times = [found for each in growing if (found := each.times(length)).num_times]
-            if times:
-                last = max(times, key=lambda found: found.last_time)
+            growing = [event for event in events if isinstance(event, StepEvent) and event.most_gaussians is not None]
+            growths = [times for times in (event.times(length) for event in growing) if times.num_times]
+            if growths:
+                last = max(growths, key=lambda times: times.last_time)
                 floaters = dataclasses.replace(floaters, at=during_growth(floaters.at, length, last))
                 if not floaters.at:
                     raise ValueError(
@@ -113,7 +113,8 @@ class LimitExponents(StepEvent):
         check_number("least", self.least, least=0, most=1)
 
     def apply(self, now: Now, model: Model, moments: AdamState, state: tuple[()]) -> Change:
-        if (shapes := model.appearance.shapes) is None:
+        shapes = model.appearance.shapes
+        if shapes is None:
             raise ValueError("LimitExponents needs kernels with exponents, such as Appearance(exponents=Exponents())")
         share = jnp.log(jnp.asarray(self.least, shapes.dtype)) / LARGEST_LOG_EXPONENT
         least = jnp.arctanh(jnp.clip(share, -MOST_SHARE, MOST_SHARE))
