@@ -19,10 +19,10 @@ from a2tg_jax.core.checks import check_int, check_literal
 from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.host.regular_files import expanded
-from a2tg_jax.host.text import PROGRAM, shortened
+from a2tg_jax.host.text import shortened
 from a2tg_jax.io.columns import Ends, dequantised, ends_of, quantised
 from a2tg_jax.io.config_json import config_from_dict
-from a2tg_jax.io.gltf_container import Builder, Document, mesh_nodes
+from a2tg_jax.io.gltf_container import Builder, Document, mesh_nodes, scene_of_one
 from a2tg_jax.io.model_file import appearance_from_dict, appearance_to_dict, background_of, origin_of
 from a2tg_jax.io.model_rows import Rows, check_encodable, model_of, rows_of_model
 from a2tg_jax.io.other_programs import (
@@ -146,15 +146,8 @@ def save_gltf(
     node = {"name": "splats", "mesh": 0, "matrix": matrix.T.ravel().tolist()}
     # Mode 0: points, which programs without the extension show.
     primitive = {"attributes": attributes, "mode": 0, "extensions": {SPLATS: described}, "extras": {OWN: kept}}
-    whole = {
-        "asset": {"version": "2.0", "generator": PROGRAM},
-        "extensionsUsed": [SPLATS, *described.get("extensions", {})],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [node],
-        "meshes": [{"primitives": [primitive]}],
-    }
-    builder.save(expanded(path), whole)
+    used = [SPLATS, *described.get("extensions", {})]
+    builder.save(expanded(path), {"extensionsUsed": used, **scene_of_one(node, primitive)})
 
 
 def _extension_of(builder: Builder, model: Model, kind: TexelKind) -> dict[str, Any]:
