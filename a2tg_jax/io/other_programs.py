@@ -52,7 +52,7 @@ LEVEL = math.cos(math.radians(3))
 LEAST_SCALE = 1e-30
 LEAST_OPACITY = 1e-6
 FILTER = "filter_3D"
-"""Name of the widths of Mip-Splatting's filter, in PLY files and checkpoints."""
+"""Name of the widths of Mip-Splatting's filter in PLY files."""
 LEAST_LENGTH = 1e-9
 """Length of a quaternion below which, and above whose inverse, it is made a unit quaternion."""
 LEAST_THIRD_SCALE = math.exp(-20)
