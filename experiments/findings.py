@@ -183,7 +183,7 @@ def rows_at_length(grid: Grid, degree: int, records: Mapping[str, Record], place
     rows = []
     for num, results in tables.grouped(tables.results_of(grid, records), lambda result: result.run.cell.gaussians):
         at_size = f"{place}, {num:,} Gaussians" if has_sizes else place
-        is_on_page = not has_sizes or (num, degree) == SIZE_OF_ENDPOINT
+        is_on_page = (num, degree) == SIZE_OF_ENDPOINT if has_sizes else place != PLACES["long"]
         rows += rows_against(grid, degree, results, own, at_size, is_on_page)
         if degree == 3:
             zero = suffixed(MCMC, 0) + EQUAL_BYTES
@@ -278,7 +278,7 @@ def with_interval(found: Comparison, figure: str) -> str:
 
 
 def emphasized(text: str, found: Comparison) -> str:
-    """Return a text in bold if the t interval of its comparison excludes 0."""
+    """Return a text in bold if its comparison is decided."""
     return f"**{text}**" if found.is_decided else text
 
 

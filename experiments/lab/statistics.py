@@ -14,6 +14,8 @@ from lab.jobs import Record
 from lab.tables import CONFIDENCE, QUALITY, Result, SceneMean, grouped, over_scenes
 
 NUM_DRAWS = 10_000
+LEVEL = 1 - CONFIDENCE
+"""Level of p-values."""
 Differences = Mapping[str, Sequence[np.ndarray]]
 """Differences of the views of every pair [V], by scene."""
 
@@ -30,8 +32,8 @@ class Comparison:
 
     @property
     def is_decided(self) -> bool:
-        """Whether the t interval excludes 0."""
-        return abs(self.over_scenes.mean) > self.over_scenes.half_width
+        """Whether the t interval excludes 0, and the p-value is below the level."""
+        return abs(self.over_scenes.mean) > self.over_scenes.half_width and self.p_value < LEVEL
 
     @property
     def num_won(self) -> int:
