@@ -12,7 +12,8 @@ from lab.markdown import table
 from lab.statistics import Comparison, bootstrap, compare, holm
 from lab.tables import EQUAL_TIME, Result
 
-BYTEWISE, STRONGEST = "Bytewise", "Strongest plain method"
+BYTEWISE = "Bytewise"
+STRONGEST = "Strongest plain method"
 ELLIPSOIDS = "3DGS-MCMC, its weights, degree {}"
 OTHERS = {
     STRONGEST + EQUAL_TIME: "strongest plain method, equal time",

@@ -37,9 +37,14 @@ LEAST_SCENES = 3
 """Smallest number of scenes of a row on the page: an interval of two says nothing."""
 QUICK, QUICK_SIZE = "in `quick`", 60
 """Name of E1's place in the table, and its bytes per pixel; other sizes are in NOTEBOOK.md."""
-DENSE, FEW = "dense", "few views"
-BEST, MCMC, TEXTURED = "Best plain method", "2DGS*-MCMC", "Textured Gaussians*"
-BYTEWISE, SECOND, FIRST = "Bytewise", "Bytewise, second version", "Bytewise, first version"
+DENSE = "dense"
+FEW = "few views"
+BEST = "Best plain method"
+MCMC = "2DGS*-MCMC"
+TEXTURED = "Textured Gaussians*"
+BYTEWISE = "Bytewise"
+SECOND = "Bytewise, second version"
+FIRST = "Bytewise, first version"
 VERSIONS = {BYTEWISE: "bytewise", SECOND: "bytewise 2", FIRST: "bytewise 1"}
 """Names in the table of `bytewise` and of its earlier versions: the second places no Gaussians by errors of pictures,
 and the first has textures and no weight on opacities either."""
@@ -111,7 +116,8 @@ def rows_of_bytewise(results: Sequence[Result], in_equal_time: Sequence[Result])
     """Return the comparisons of `bytewise`, by stratum and budget. At equal iterations, all runs count. At equal time,
     plain methods in `results` trained for as long as the first version, and in `in_equal_time` for as long as the
     present one."""
-    rows, order = [], list(VERSIONS)
+    rows = []
+    order = list(VERSIONS)
     for stratum in (DENSE, FEW):
         for budget in (0.3, 1.2):
             own, timed = (

@@ -55,7 +55,8 @@ def differences(results: Sequence[Result], label: str, other: str, figure: str) 
         views = {result.label: _by_view(result.record) for result in block if result.label in (label, other)}
         if len(views) < 2:
             continue
-        own, base = views[label], views[other]
+        own = views[label]
+        base = views[other]
         if own.keys() != base.keys():
             raise ValueError(f"{label} and {other} were scored on different views of {cell.scene.label}")
         pair = [np.array([figures[name][place] for name in own], float) for figures in (own, base)]  # None is NaN.
@@ -106,7 +107,8 @@ def _scene_means(pairs: Sequence[np.ndarray], num: int, rng: np.random.Generator
 
 def holm(p_values: Mapping[str, float]) -> dict[str, float]:
     """Return p-values corrected for their number by Holm's step-down procedure."""
-    corrected, highest = {}, 0.0
+    corrected = {}
+    highest = 0.0
     for index, (name, p_value) in enumerate(sorted(p_values.items(), key=lambda item: item[1])):
         highest = max(highest, min(1.0, (len(p_values) - index) * p_value))
         corrected[name] = highest
