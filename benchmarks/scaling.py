@@ -42,8 +42,10 @@ from benchmarks.timing import memory_peak
 from benchmarks.workload import random_scene
 from experiments.lab.markdown import table as markdown
 
-NUMS, DEVICES = (100_000, 1_000_000, 4_000_000), (1, 2, 4, 8, 16, 64)
-WIDTH, HEIGHT = 1600, 1060
+NUMS = (100_000, 1_000_000, 4_000_000)
+DEVICES = (1, 2, 4, 8, 16, 64)
+WIDTH = 1600
+HEIGHT = 1060
 SPLAT, PROBE, CUTOFF = 9 + 1 + 3 + 3, 4, 1
 """Numbers of a travelling row: homography, opacity, colour and normal of a splat; its statistic, and its cutoff."""
 CHANNELS = 4
