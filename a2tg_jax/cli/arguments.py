@@ -14,7 +14,7 @@ from docstring_parser import parse_from_object
 from tyro.conf import Positional, arg
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from a2tg_jax.host.remote_files import is_url, without_secrets
+from a2tg_jax.host.regular_files import expanded
 from a2tg_jax.host.text import defaulting_to
 
 Parsed = TypeVar("Parsed")
@@ -54,7 +54,7 @@ def parse(kind: type[Parsed], program: str, arguments: Sequence[str], default: P
 
     Raises:
       SystemExit: after help (code 0) or an error (code 2), which tyro has printed.
-      ValueError: if a URL is given where only paths on this machine work.
+      ValueError: if a path is a URL.
     """
     if {"-h", "--help"} & set(arguments):  # It takes a second.
         _fill_help(default or kind)
@@ -65,11 +65,9 @@ def parse(kind: type[Parsed], program: str, arguments: Sequence[str], default: P
     if default is not None:
         about, given = about.split("\n")[0], {"default": default}  # The other lines are the short help.
     command: Parsed = tyro.cli(kind, prog=program, args=arguments, description=about, registry=rules, **given)
-    scene = getattr(getattr(getattr(command, "record", None), "scene", None), "path", None)
     for word in arguments:
-        text = word.partition("=")[2] if word.startswith("--") else word
-        if text != scene:
-            check_path(text)
+        # Raises ValueError for a URL, which would name a folder of this machine.
+        expanded(word.partition("=")[2] if word.startswith("--") else word)
     return command
 
 
@@ -77,13 +75,6 @@ def at_home(word: str) -> str:
     """Return an argument with the home folder for a leading ~, also in --out=~/x, where shells leave it."""
     flag, equals, text = word.partition("=") if word.startswith("--") else ("", "", word)
     return flag + equals + os.path.expanduser(text)
-
-
-def check_path(text: str) -> None:
-    """Raise ValueError if a path is a URL, which would name a folder of this machine."""
-    if is_url(text):
-        url = without_secrets(text)
-        raise ValueError(f"{url}: only SCENE of a2tg train may be a URL; copy it here, or mount the bucket")
 
 
 def _fill_help(value: Any) -> None:

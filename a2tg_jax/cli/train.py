@@ -16,12 +16,13 @@ import tyro
 from tyro.conf import arg
 
 from a2tg_jax.adapt import Upscale
-from a2tg_jax.cli.arguments import LpipsWeights, check_path
+from a2tg_jax.cli.arguments import LpipsWeights
 from a2tg_jax.core.budget import budget_in_bytes
 from a2tg_jax.data.load import SceneSource
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.host.machine import tidy_memory
 from a2tg_jax.host.operating_system import has_display
+from a2tg_jax.host.regular_files import expanded
 from a2tg_jax.host.text import counted, defaulting_to
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.mcmc import Mcmc
@@ -93,7 +94,7 @@ class Demo:
 class Train:
     """Train a scene, evaluate the model and write a report.
 
-      SCENE                  scene folder with photographs and cameras, its URL, or built in: "synthetic", "cells"
+      SCENE                  scene folder with photographs and cameras, or built in: "synthetic", "cells"
       --out RUN              run folder for models, checkpoints, metrics, pictures and report.html
       --system NAME          method: bytewise (default; the best picture for its bytes), a2tg (the paper's), ...
       --preset NAME          paper (default), quick (minutes on two cores) or smoke (half a minute)
@@ -285,8 +286,8 @@ def train_defaults(arguments: Sequence[str]) -> Train:
       ValueError, FileNotFoundError: if there is no such system, preset, file or run, or it is invalid.
     """
     found, _ = tyro.cli(DecidingOptions, prog="a2tg train", args=arguments, return_unknown_args=True, add_help=False)
-    check_path(found.config)
-    check_path(found.out)
+    for path in (found.config, found.out):
+        expanded(path)  # Raises ValueError for a URL.
     record = RunRecord(SceneSource())
     if found.resume and found.config:
         raise ValueError("--resume takes every option from the run folder: leave out --config")

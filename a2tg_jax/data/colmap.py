@@ -19,7 +19,7 @@ from a2tg_jax.data.lenses import checked_lens
 from a2tg_jax.data.photo_reading import Options, Photo, read_photos
 from a2tg_jax.data.ply import read_ply_points
 from a2tg_jax.data.scene import Scene, scene_name
-from a2tg_jax.host.regular_files import is_folder, is_regular, names_in
+from a2tg_jax.host.regular_files import is_regular, names_in
 from a2tg_jax.host.text import counted
 
 SUFFIXES = (".bin", ".txt")
@@ -269,11 +269,11 @@ def _find_photos(path: Path, model: Path, images: Sequence[ImageRecord], downsca
 
     for base in bases:
         names = sorted((name for name in names_in(base) if name.lower() == IMAGES), reverse=True)  # "images" first
-        folder = next((base / name for name in names if is_folder(base / name)), None)
+        folder = next((base / name for name in names if (base / name).is_dir()), None)
         if folder is not None:
             # A folder `images` may be another program's, or be part of the names.
             return base, base if holds_some(base) and not holds_some(folder) else folder
-        if downscale > 1 and is_folder(base / f"{IMAGES}_{downscale}"):
+        if downscale > 1 and (base / f"{IMAGES}_{downscale}").is_dir():
             return base, base / IMAGES
     for base in bases:
         if holds_some(base):

@@ -18,7 +18,6 @@ import numpy as np
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from a2tg_jax.host.regular_files import open_regular
-from a2tg_jax.host.remote_files import is_remote
 from a2tg_jax.host.text import shortened
 
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "AVIF", "BMP", "GIF", "PPM")
@@ -199,12 +198,12 @@ def _opened(path: str | os.PathLike[str], most_bits: int = 8, is_decoded: bool =
                 raise ValueError(f"{path}: has more than 8 bits per channel; convert it to an 8-bit image")
             yield image
     except Exception as error:  # Damaged pictures raise anything from SyntaxError to struct.error.
-        if str(error).startswith(f"{path}: "):  # Raised above, or by a store that does not answer.
+        if str(error).startswith(f"{path}: "):  # Raised above.
             raise
         reason = shortened(str(error) or type(error).__name__, LONGEST_REASON)
         if isinstance(error, UnidentifiedImageError):  # Its text names an object of Python instead of the file.
-            is_empty = not is_remote(path) and not os.path.getsize(path)
-            reason = "it is empty: 0 bytes" if is_empty else f"it is none of {', '.join(FORMATS)}"
+            known = f"it is none of {', '.join(FORMATS)}"
+            reason = known if os.path.getsize(path) else "it is empty: 0 bytes"
         raise ValueError(f"{path}: cannot be read as an image ({reason}); replace or remove it") from error
 
 

@@ -30,8 +30,7 @@ from a2tg_jax.data.transforms import (
     load_transforms,
     transforms_in,
 )
-from a2tg_jax.host.regular_files import is_regular
-from a2tg_jax.host.remote_files import RemotePath, check_reachable, is_remote, is_url, located
+from a2tg_jax.host.regular_files import expanded, is_regular
 from a2tg_jax.host.text import as_argument
 
 HeldOut = Literal["test", "validation"]
@@ -44,7 +43,7 @@ class SceneSource:
     """Source of a scene: what `a2tg train` parses, what run.toml keeps, and what `load` needs."""
 
     path: Annotated[Positional[str], arg(metavar="SCENE")] = ""
-    """Scene folder with photographs and cameras, its URL such as s3://bucket/scene, or a built-in scene, "synthetic" or
+    """Scene folder with photographs and cameras, or a built-in scene, "synthetic" or
     "cells"; not needed with --config or --resume."""
     downscale: int = 1
     """Factor k by which images are downscaled."""
@@ -75,9 +74,8 @@ class SceneSource:
         """Name of the scene in titles."""
         if self.is_built_in:
             return self.path
-        # os.path, because Path would make one slash of the two in a URL.
-        folder = os.path.dirname(self.path) if Path(self.path).suffix in (".json", ".xml") else self.path
-        return scene_name(folder if is_url(folder) else Path(folder))
+        path = Path(self.path)
+        return scene_name(path.parent if path.suffix in (".json", ".xml") else path)
 
     def load(self, room: int | None = None) -> Scene:
         """Return the scene, which may be a built-in one. Same arguments and errors as `load_scene`."""
@@ -85,7 +83,7 @@ class SceneSource:
 
 
 def load_scene(
-    path: str | os.PathLike[str] | RemotePath,
+    path: str | os.PathLike[str],
     *,
     downscale: int = 1,
     test_every: int = 8,
@@ -104,8 +102,7 @@ def load_scene(
     a pose are ignored. Masks, black at excluded pixels, are in `masks` next to `images`, or at `mask_path`.
 
     Args:
-      path: the scene folder, a transforms.json, or an XML file of Metashape's cameras; or a URL, such as s3://bucket/x,
-        or UPath of universal_pathlib, of a COLMAP, transforms.json or Blender scene.
+      path: the scene folder, a transforms.json, or an XML file of Metashape's cameras.
       downscale: k >= 1; images are read from `images_k` if it holds all of them at 1/k of their size, and downscaled
         from the full ones otherwise.
       test_every: every k-th of the name-sorted views, from the first, is a test view; 0 keeps none. The views of a
@@ -124,7 +121,6 @@ def load_scene(
 
     Raises:
       FileNotFoundError: if the path, or an image or mask named by the scene, does not exist, or the path is no scene.
-      OSError: if a store does not answer.
       ValueError: if an argument, the model, a pose, an image or a mask is unusable, or fewer than two views are left.
 
     Examples:
@@ -167,7 +163,7 @@ def _load(source: SceneSource, room: int | None, is_built_in: bool = False) -> S
                 source.lens,
                 shelf,
             )
-            scene = _read(located(source.path), options)
+            scene = _read(expanded(source.path), options)
         finally:
             forget_rays()
         warn_of_lenses(scene)
@@ -176,28 +172,17 @@ def _load(source: SceneSource, room: int | None, is_built_in: bool = False) -> S
 
 def _read(path: Path, options: Options) -> Scene:
     """Read the scene at a path, or raise FileNotFoundError that says what is there instead."""
-    is_here = not is_remote(path)
-    if is_here and not path.exists():
+    if not path.exists():
         built_in = f"; the built-in scene is {path}_scene()" if str(path) in BUILT_IN else ""
         raise FileNotFoundError(f"{path}: no such scene folder{built_in}")
-    is_json = path.suffix.lower() == ".json"
-    if is_here:
-        if is_video(path):
-            command = f"`a2tg sfm {as_argument(path)} SCENE`"
-            raise ValueError(f"{path}: is a video; to make a scene of it, run {command} first")
-        # OpenSfM's reconstruction.json is JSON as well, but no transforms file.
-        is_json = is_json and is_regular(path) and capture_hint(path) is None
-    else:
-        check_reachable(path.parent if path.suffix.lower() in (".json", ".xml") else path)
-    if is_json:
+    if is_video(path):
+        command = f"`a2tg sfm {as_argument(path)} SCENE`"
+        raise ValueError(f"{path}: is a video; to make a scene of it, run {command} first")
+    # OpenSfM's reconstruction.json is JSON as well, but no transforms file.
+    if path.suffix.lower() == ".json" and is_regular(path) and capture_hint(path) is None:
         return load_transforms(path, options)
     if (load := _loader(path)) is not None:
         return load(options)
-    if not is_here:
-        raise FileNotFoundError(
-            f"{path}: has none of the scenes that are read from a URL: sparse/0, transforms.json or "
-            "transforms_train.json; copy others to a folder, or mount the bucket (mountpoint-s3, gcsfuse, rclone mount)"
-        )
     if (make := _frames(path)) is not None:
         return load_frames(make(), options)
     hint = capture_hint(path)

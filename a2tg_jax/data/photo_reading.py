@@ -27,8 +27,6 @@ from a2tg_jax.data.image_files import find_image, map_in_threads, on_disk
 from a2tg_jax.data.lenses import Lens, LensUse, resize_pixels
 from a2tg_jax.data.photo_store import DepthMap, Mask, Shelf
 from a2tg_jax.host.npz import read_npy
-from a2tg_jax.host.regular_files import is_folder
-from a2tg_jax.host.remote_files import Unreachable, is_remote
 from a2tg_jax.host.text import shortened
 
 MASKS, DEPTHS = "masks", "depths"
@@ -113,7 +111,7 @@ def read_photos(
       root: the scene's folder, which has no smaller copies: its siblings are other scenes.
       how_to_remove: function from an image name to advice on removing it from the scene.
     """
-    found = _find_files(photos, options.downscale, place, root, how_to_remove)
+    found = _find_files(photos, options.downscale, root, how_to_remove)
     names: dict[Path, str] = {}
     for own in found:  # Where capitals or suffixes were lost, one file may fit two names.
         if names.setdefault(own.file, own.photo.name) != own.photo.name:
@@ -121,15 +119,15 @@ def read_photos(
                 f"{own.file}: is the only file for {names[own.file]} and {own.photo.name}; put both there, or remove "
                 "one from the scene"
             )
-    read = map_in_threads(lambda own: _read(own, options), found, place=place)
+    read = map_in_threads(lambda own: _read(own, options), found)
     shots = [shot for shot, _ in read]
     lacking = [own.photo.name for own in found if own.mask is None]
     if len(lacking) == len(found):
         folders = {photo.below_images[0].with_name(MASKS) for photo in photos if photo.below_images}
-        for folder in filter(is_folder, folders):
+        for folder in filter(Path.is_dir, folders):
             message = f"{folder}: holds no mask of a photograph of the scene, called NAME.jpg.png or NAME.png: not used"
             warnings.warn(message, stacklevel=3)
-        for root in {folder.parent for folder in folders if isinstance(folder, Path)}:
+        for root in {folder.parent for folder in folders}:
             for folder in sorted(root.glob("*[mM]ask*/")):
                 if not folder.name.startswith(MASKS):
                     warnings.warn(f"{folder}: not read; if it holds masks, rename it to {MASKS}", stacklevel=3)
@@ -164,8 +162,8 @@ def _read(found: _Found, options: Options) -> tuple[Shot, bool]:
         full = stored
         if downscale < options.downscale:  # The file is a smaller copy, and the full image may be missing.
             full = options.downscale * stored[0], options.downscale * stored[1]
-            # In object storage, each size would be another request.
-            if not is_remote(file) and (original := find_image(*photo.image)) is not None:
+            original = find_image(*photo.image)
+            if original is not None:
                 full = picture_size(original)
         lens = lens(full)
     (width, height), (camera_width, camera_height) = stored, lens.size
@@ -213,7 +211,7 @@ def _read(found: _Found, options: Options) -> tuple[Shot, bool]:
 
 
 def _find_files(
-    photos: Sequence[Photo], downscale: int, place: Path, root: Path, how_to_remove: Callable[[str], str]
+    photos: Sequence[Photo], downscale: int, root: Path, how_to_remove: Callable[[str], str]
 ) -> list[_Found]:
     """Return the files of photographs, from folders of smaller copies where they are complete."""
 
@@ -230,7 +228,7 @@ def _find_files(
                 return folder, found.relative_to(each).as_posix()
         return None
 
-    masks = map_in_threads(find_mask, photos, place=place)
+    masks = map_in_threads(find_mask, photos)
     named = [*(photo.image for photo in photos), *(mask for mask in masks if mask is not None)]
     copies = _find_copies(named, downscale, root)
 
@@ -250,7 +248,7 @@ def _find_files(
         factor = 1 if folder in copies else downscale
         return None if image is None else _Found(photo, image, factor, mask_file, depths)
 
-    files = map_in_threads(find, photos, masks, place=place)
+    files = map_in_threads(find, photos, masks)
     missing = [photo.image for photo, own in zip(photos, files, strict=True) if own is None]
     if missing:
         (folder, name), num = missing[0], len(missing)
@@ -267,7 +265,7 @@ def _find_copies(files: Sequence[tuple[Path, str]], downscale: int, root: Path) 
 
     Such a folder may also be another clip of the scene. It counts if the scene names no file in it, and it has a copy
     of each file of NAME, 1/k as large. A folder that fails is not used, with a warning. Files whose full size is
-    missing, cannot be read or is in object storage are not compared.
+    missing or cannot be read are not compared.
 
     Args:
       files: folder, and path below it, of every photograph and mask that the scene names.
@@ -282,8 +280,6 @@ def _find_copies(files: Sequence[tuple[Path, str]], downscale: int, root: Path) 
             return ""
         if copy is None:
             return f"{name}, which is missing"
-        if is_remote(full):
-            return ""
         with contextlib.suppress(ValueError):  # A photograph may be too large to be read in full.
             size, copied = picture_size(full), picture_size(copy)
             if any(abs(side - whole / downscale) > ROUNDING for side, whole in zip(copied, size, strict=True)):
@@ -294,10 +290,10 @@ def _find_copies(files: Sequence[tuple[Path, str]], downscale: int, root: Path) 
     named = {(folder / name).parent for folder, name in files} if downscale > 1 else set()
     for folder in dict.fromkeys(folder for folder, _ in files if downscale > 1 and folder != root):
         smaller = folder.with_name(f"{folder.name}_{downscale}")
-        if not is_folder(smaller) or any(each.is_relative_to(smaller) for each in named):
+        if not smaller.is_dir() or any(each.is_relative_to(smaller) for each in named):
             continue
         names = [name for own, name in files if own == folder]
-        if unlike := [each for each in map_in_threads(difference, names, place=folder) if each]:
+        if unlike := [each for each in map_in_threads(difference, names) if each]:
             warnings.warn(
                 f"{smaller}: does not hold the files of {folder} at 1/{downscale} of their size, for {len(unlike)} of "
                 f"{len(names)}, such as {unlike[0]}: not used",
@@ -412,8 +408,6 @@ def read_depths(file: str | os.PathLike[str]) -> np.ndarray:
     if str(file).endswith(".npy"):
         try:
             values = read_npy(file)
-        except Unreachable:
-            raise
         except Exception as error:  # Damaged files raise anything from SyntaxError to struct.error.
             if str(error).startswith(f"{file}: "):  # It says already which file and what to do.
                 raise

@@ -25,7 +25,6 @@ from a2tg_jax.finish.tuning import ITERATIONS
 from a2tg_jax.host import signals
 from a2tg_jax.host.errors import error_text
 from a2tg_jax.host.machine import Devices, this_machine
-from a2tg_jax.host.remote_files import is_url
 from a2tg_jax.io.archive import read_archive_header
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.io.formats import load_splats
@@ -120,8 +119,7 @@ def begin_run(record: RunRecord, out: Path, options: RunOptions) -> RunResult:
     for system in record.systems.values():
         check_batch_size(system.batch_size, options.session.num_devices)
     check_weights(options.lpips_weights)
-    # Neither is a folder here.
-    if not record.scene.is_built_in and not is_url(record.scene.path):
+    if not record.scene.is_built_in:
         check_apart(out, Path(record.scene.path))
     # Cheap checks come before the scene is loaded.
     check_free(out, overwrite=options.overwrite)
