@@ -8,6 +8,7 @@ and the gradients of all views to the device that has the row, which sums them i
 A mesh of None is one device, on which these functions return what they are given.
 """
 
+import atexit
 import contextlib
 import os
 import sys
@@ -56,8 +57,8 @@ def in_views(mesh: Mesh | None, function: Callable[[Any, Any], T]) -> Callable[[
     so that each device calls it with its own views."""
     if mesh is None:
         return function
-    # Not left to XLA, which cannot divide the call of a kernel. The loops of XLA do not say which devices their carries
-    # differ on.
+    # Not left to XLA, which cannot divide the call of a kernel. check_vma=False, because the loops of `xla` do not
+    # declare which devices their carries differ on.
     return jax.shard_map(function, mesh=mesh, in_specs=(P(), P(AXIS)), out_specs=P(AXIS), check_vma=False)
 
 
@@ -125,8 +126,8 @@ def _of_first_process(mesh: Mesh, tree: T) -> T:
     digests = multihost_utils.process_allgather(np.asarray(zlib.crc32(shapes.encode()), np.uint32))
     if len(np.unique(digests)) > 1:
         raise ValueError("the processes differ after a change of the model: train on machines that are alike")
-    found: T = multihost_utils.broadcast_one_to_all(tree)
-    return found
+    of_first: T = multihost_utils.broadcast_one_to_all(tree)
+    return of_first
 
 
 def everywhere(mesh: Mesh | None, tree: T) -> T:
@@ -237,12 +238,18 @@ def joined(place: ProcessPlace | None, advice: Callable[[], str]) -> Iterator[No
         leave()
     except Exception as error:
         if not is_lost(error):
+            # Before JAX's own function at the exit of Python, which would wait for the others and then abort.
+            atexit.register(_exit, 2 if isinstance(error, ValueError | OSError) else 1)
             raise
         print(f"a2tg: error: another process was lost: {shortened(str(error), 200)}; {advice()}", file=sys.stderr)
-        sys.stdout.flush()
-        sys.stderr.flush()
-        # Not `sys.exit`: JAX would wait for the others.
-        os._exit(LOST)
+        _exit(LOST)
+
+
+def _exit(code: int) -> None:
+    """End the process without a word to the others, which JAX ends in turn."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
 
 
 def leave() -> None:
