@@ -215,7 +215,8 @@ def _prefixes(sources: Sequence[Path]) -> list[str]:
     if len(sources) == 1:
         return [""]
     stems = [source.stem if is_video(source) else source.name for source in map(Path.resolve, sources)]
-    return [f"{stem}/" for stem in _made_unique([stem or "photos" for stem in stems])]
+    unique = _made_unique([stem or "photos" for stem in stems])
+    return [f"{stem}/" for stem in unique]
 
 
 def _made_unique(names: Sequence[str], others: Iterable[str] = ()) -> list[str]:
