@@ -177,7 +177,8 @@ def _start(
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return the points [P, 3] to start from, in the normalised world, and their colours [P, 3] uint8.
 
-    They are those of the cloud if training views see them. Warnings say if not all do, or where other points are from.
+    The cloud's points are used if training views see some. Warnings count views that see none, or say which other
+    points are used.
     """
     sights = [shot.sight(viewmats[shot.name]) for shot in train]
     lacks = "has no"

@@ -57,7 +57,7 @@ class Cameras(NamedTuple):
     """Cameras of another program that were found in a folder."""
 
     file: Path
-    """Their file or folder, which tells them from others next to them."""
+    """Their file or folder, which messages name."""
     read: Callable[[], Frames]
     """Function that reads them."""
 
