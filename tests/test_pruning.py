@@ -101,12 +101,6 @@ def test_a_number_is_kept():
     assert change.model.num == model.num
 
 
-def test_the_weights_are_those_of_the_first_process(monkeypatch):
-    monkeypatch.setattr(pruning, "of_first", lambda mesh, arrays: [np.arange(len(x)) for x in arrays])
-    change = pruned(Prune(keep=10))[-1]
-    np.testing.assert_array_equal(np.diff(change.rows[:10]), 1)
-
-
 def test_degrees_stay_with_their_gaussians():
     model, _, camera = banded(0)
     with pytest.raises(ValueError, match="prune before"):
