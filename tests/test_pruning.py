@@ -17,7 +17,6 @@ import a2tg_jax as a2tg
 from a2tg_jax.core.optim import adam_init
 from a2tg_jax.core.pytree import partition
 from a2tg_jax.data.scene import View
-from a2tg_jax.densify import pruning
 from a2tg_jax.densify.pruning import Prune, shown_in
 from a2tg_jax.densify.splitting import SplitByGradient
 from a2tg_jax.events import Due
