@@ -167,9 +167,9 @@ def check_rows_fit(
         place = "this machine (its container and ulimit included)" if default_platform() == "cpu" else "the GPU"
         raise ValueError(
             f"{names} is too large for {place}: stage {stage.name!r} trains up to {forecast.num_rows:,} Gaussians of "
-            f"{forecast.model_bytes / forecast.num_rows:,.0f} bytes, and {copies} copies of them (parameters, gradients "
-            f"and two moments) take at least {in_bytes(needed)} of memory, but {in_bytes(limit)} may be used: lower it, "
-            f"to a model of less than {in_bytes(limit / copies)}, or allow more with max_memory"
+            f"{forecast.model_bytes / forecast.num_rows:,.0f} bytes, and {copies} copies of them (parameters, "
+            f"gradients and two moments) take at least {in_bytes(needed)} of memory, but {in_bytes(limit)} may be "
+            f"used: lower it, to a model of less than {in_bytes(limit / copies)}, or allow more with max_memory"
         )
 
 

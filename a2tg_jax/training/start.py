@@ -221,8 +221,8 @@ def given_start(start: Model, scene: Scene, system: System, index: int) -> Model
 
 
 def left_out(model: Model, degree: int, template: Appearance | None) -> list[str]:
-    """Return in words what is dropped of a model if its spherical harmonics get a degree, and its appearance the options
-    of a template, which keeps only the shapes of kernels. Template None: the appearance is kept."""
+    """Return in words what a model loses if its spherical harmonics get a degree, and its appearance the options of a
+    template, which keeps only the shapes of kernels. Template None: the appearance is kept."""
     appearance = model.appearance
     lost = []
     has_shapes = appearance.exponents is not None

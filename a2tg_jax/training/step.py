@@ -243,8 +243,8 @@ def attempt(
     after = TrainState(change.model, change.moments, events, iteration, state.status, corrections)
     made: Any = partition(change.model)[0]
     if settings.due is not None:
-        # Adam's results are finite if the gradients are, so only leaves that a projection or an event has changed (other
-        # tracers) are checked: the check makes a GPU write a leaf twice.
+        # Adam's results are finite if the gradients are. Only leaves that a projection or an event has changed, which
+        # are other tracers, are checked, because the check makes a GPU write a leaf twice.
         ids_after_adam = {id(leaf) for leaf in jax.tree.leaves(step.params)}
         made = [leaf for leaf in jax.tree.leaves(made) if id(leaf) not in ids_after_adam]
     rows_after = [correction.rows for correction in corrections]
