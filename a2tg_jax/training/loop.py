@@ -470,17 +470,13 @@ class StageRun:
                 change = checked_change(change)
             self.effects.apply(place, self.state, change)
             self.state = dataclasses.replace(self.state, model=change.model, moments=change.moments)
-            if change.rows is not None:
-                self._move_rows(change.rows)
+            if change.rows is not None:  # Statistics of other events move along with the Gaussians.
+                pairs = zip(self.stage.events, self.state.events, strict=True)
+                states = (None if state is None else other.gather(state, change.rows) for other, state in pairs)
+                self.state = dataclasses.replace(self.state, events=tuple(states))
             is_dropped = iteration == due[-1] and event.observes and self._is_worth_dropping(iteration)
             self._keep(place, None if is_dropped else change.state)
         self.state = divided(self.mesh, self.state)
-
-    def _move_rows(self, rows: np.ndarray) -> None:
-        """Move the events' statistics along with the Gaussians."""
-        pairs = zip(self.stage.events, self.state.events, strict=True)
-        events = tuple(None if state is None else event.gather(state, rows) for event, state in pairs)
-        self.state = dataclasses.replace(self.state, events=events)
 
     def _keep(self, place: int, state: object) -> None:
         """Replace the state of the event at a place."""
