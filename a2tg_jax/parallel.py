@@ -207,11 +207,11 @@ class ProcessPlace(NamedTuple):
 def joined(place: ProcessPlace | None, advice: Callable[[], str]) -> Iterator[None]:
     """Join the other processes within the block; None: there are none.
 
-    If another process is lost, this one ends as well, with the advice in its message, or, where it waits for the other
-    one, by JAX.
+    If another process is lost, this one ends as well: with the advice in its message, or, where it waits for the other
+    one, by JAX. JAX also ends it if not all join within `JOIN_SECONDS`.
 
     Raises:
-      ValueError: if a number is wrong, JAX detects no cluster, or not all processes join.
+      ValueError: if a number is wrong, or JAX detects no cluster.
     """
     if place is None:
         yield

@@ -11,7 +11,7 @@ from lab.grid import Grid, read_grid
 from lab.jobs import Record
 from lab.kept import read_kept
 from lab.statistics import Comparison, bootstrap, compare, differences, holm
-from lab.tables import EQUAL_BYTES, Result
+from lab.tables import EQUAL_BYTES, EQUAL_TIME, Result
 from matplotlib.figure import Figure
 
 from a2tg_jax.results.figures import save_figure
@@ -37,13 +37,17 @@ LEAST_SCENES = 3
 """Smallest number of scenes of a row on the page: an interval of two says nothing."""
 QUICK, QUICK_SIZE = "in `quick`", 60
 """Name of E1's place in the table, and its bytes per pixel; other sizes are in NOTEBOOK.md."""
-DENSE, FEW = "dense", "few views"
-BEST, MCMC, TEXTURED = "Best plain method", "2DGS*-MCMC", "Textured Gaussians*"
-BYTEWISE, SECOND, FIRST = "Bytewise", "Bytewise, second version", "Bytewise, first version"
+DENSE = "dense"
+FEW = "few views"
+BEST = "Best plain method"
+MCMC = "2DGS*-MCMC"
+TEXTURED = "Textured Gaussians*"
+BYTEWISE = "Bytewise"
+SECOND = "Bytewise, second version"
+FIRST = "Bytewise, first version"
 VERSIONS = {BYTEWISE: "bytewise", SECOND: "bytewise 2", FIRST: "bytewise 1"}
 """Names in the table of `bytewise` and of its earlier versions: the second places no Gaussians by errors of pictures,
 and the first has textures and no weight on opacities either."""
-EQUAL_TIME = ", equal time"
 PRIMARY = f"{VERSIONS[FIRST]} − best plain method, 0.3 MB"
 REGISTERED = ", the registered endpoint"
 SECONDARY = {
@@ -112,7 +116,8 @@ def rows_of_bytewise(results: Sequence[Result], in_equal_time: Sequence[Result])
     """Return the comparisons of `bytewise`, by stratum and budget. At equal iterations, all runs count. At equal time,
     plain methods in `results` trained for as long as the first version, and in `in_equal_time` for as long as the
     present one."""
-    rows, order = [], list(VERSIONS)
+    rows = []
+    order = list(VERSIONS)
     for stratum in (DENSE, FEW):
         for budget in (0.3, 1.2):
             own, timed = (
@@ -184,7 +189,7 @@ def rows_at_length(grid: Grid, degree: int, records: Mapping[str, Record], place
     rows = []
     for num, results in tables.grouped(tables.results_of(grid, records), lambda result: result.run.cell.gaussians):
         at_size = f"{place}, {num:,} Gaussians" if has_sizes else place
-        is_on_page = not has_sizes or (num, degree) == SIZE_OF_ENDPOINT
+        is_on_page = (num, degree) == SIZE_OF_ENDPOINT if has_sizes else place != PLACES["long"]
         rows += rows_against(grid, degree, results, own, at_size, is_on_page)
         if degree == 3:
             zero = suffixed(MCMC, 0) + EQUAL_BYTES
@@ -198,7 +203,12 @@ def rows_at_length(grid: Grid, degree: int, records: Mapping[str, Record], place
 def rows_of_quick(grid: Grid, degree: int, records: Mapping[str, Record]) -> list[Row]:
     """Return the comparisons of the present A²TG of `quick` with plain Gaussians (E7)."""
     own = {suffixed(PRESENT, degree) + EQUAL_BYTES: A2TG}
-    return rows_against(grid, degree, tables.results_of(grid, records), own, QUICK, is_on_page=True)
+    rows = []
+    for size, results in tables.grouped(tables.results_of(grid, records), bytes_per_pixel):
+        is_on_page = size == QUICK_SIZE
+        place = QUICK if is_on_page else f"{size} bytes a pixel"
+        rows += rows_against(grid, degree, results, own, place, is_on_page)
+    return rows
 
 
 def rows_of_earlier_quick(grid: Grid, degree: int, records: Mapping[str, Record]) -> list[Row]:
@@ -274,7 +284,7 @@ def with_interval(found: Comparison, figure: str) -> str:
 
 
 def emphasized(text: str, found: Comparison) -> str:
-    """Return a text in bold if the t interval of its comparison excludes 0."""
+    """Return a text in bold if its comparison is decided."""
     return f"**{text}**" if found.is_decided else text
 
 

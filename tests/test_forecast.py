@@ -32,7 +32,7 @@ from a2tg_jax.results.forecast import (
     time_after,
 )
 from a2tg_jax.results.record import RunRecord, SceneSource, plan_run
-from a2tg_jax.training import SYSTEMS, cost, fitting, reports
+from a2tg_jax.training import SYSTEMS, fitting, reports
 from a2tg_jax.training.corrections import BilateralGrid, sliced
 from a2tg_jax.training.cost import Bytes, check_rows_fit, forecast_stages, stage_bytes
 from a2tg_jax.training.loop import StageRun

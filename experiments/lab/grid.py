@@ -156,7 +156,8 @@ class Grid:
         return self._job(method, dataclasses.replace(cell, budget=None, gaussians=splats_in(mb, method)))
 
     def _job(self, method: Method, cell: Cell) -> Job:
-        scene, place = cell.scene, f"{self.name}{SUFFIX}: {method.label!r}"
+        scene = cell.scene
+        place = f"{self.name}{SUFFIX}: {method.label!r}"
         if method.choices is not None:
             method = method.choices[scene.label]
         if method.by_number and cell.budget is not None:
@@ -182,11 +183,15 @@ def _system(place: str, preset: str, method: Method, cell: Cell) -> a2tg.System:
 
 
 def seconds_of(job: Job, records: Mapping[str, Record]) -> float | None:
-    """Return the time of the steps of a job and of those before it; None if one has not been timed."""
+    """Return the training time of a job and of those before it; None if one has not been timed.
+
+    Records of before E6 have the time of their steps, without what happens between them.
+    """
     chain = [job]
     while chain[-1].start is not None:
         chain.append(chain[-1].start)
-    times = [records.get(one.key, {}).get("step_seconds") for one in chain]
+    found = [records.get(one.key, {}) for one in chain]
+    times = [record.get("training_seconds", record.get("step_seconds")) for record in found]
     return None if None in times else sum(times)
 
 
@@ -223,7 +228,8 @@ def read_grid(
       ValueError: if the file lacks the scale or has a mistake, or a scene or a method is unknown.
     """
     path = grid_path(name)
-    file, place = read_grid_file(path), path.name
+    file = read_grid_file(path)
+    place = path.name
     own_table = file.scale(scale, place)
     settings, known_scenes = _settings(own_table, scale, path)
     methods = _methods(file, place)
@@ -290,9 +296,11 @@ def _methods(file: GridFile, place: str) -> dict[str, Method]:
 
 
 def _method(label: str, table: MethodTable, base: Method | None, place: str) -> Method:
-    system, options = table.system, table.options
+    system = table.system
+    options = table.options
     if base is not None:
-        system, options = system or base.system, merged(base.options, options)
+        system = system or base.system
+        options = merged(base.options, options)
     if system is None:
         raise ValueError(f"{place}: method {label!r} has neither a system nor a method that it is like")
     return Method(label, system, options, table.floats, table.most, table.by_number)
