@@ -22,7 +22,7 @@ from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.tiles import TileGrid, TileLists
 
 Compositor = Literal["cuda", "native", "xla", "autodiff"]
-"""CUDA kernels (NVIDIA GPUs), native loops (CPUs), XLA (everywhere), or XLA without a gradient of its own."""
+"""CUDA kernels (NVIDIA GPUs), native loops (CPUs), XLA (everywhere), or XLA code that JAX differentiates."""
 Wanted = Literal["auto", "cuda", "native", "xla", "autodiff"]
 """A compositor, or the first of native loops, CUDA kernels and XLA that runs on the platform that JAX compiles for."""
 

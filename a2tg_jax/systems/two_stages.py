@@ -134,7 +134,7 @@ class Kernels(NamedTuple):
 
 
 def kernels_of(rate: float | None, exponents: LimitExponents) -> Kernels:
-    """Return what kernels add that are trained at a rate; 0 or None: they are Gaussians."""
+    """Return what kernels whose shapes learn at a rate add; 0 or None: all kernels are Gaussians."""
     if not rate:
         return Kernels(None, {}, ())
     return Kernels(Exponents(), {"exponents": rate}, (exponents,) if exponents.least else ())

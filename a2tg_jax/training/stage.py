@@ -117,8 +117,8 @@ class Stage(NamedFields):
     cools_down: bool = static(default=False)
     """Whether all learning rates also fall linearly over the stage, to a tenth at its end."""
     continues: bool = static(default=False)
-    """Whether this is the stage before for further iterations: it begins with that one's last state, Adam's moments
-    included, and all schedules, such as learning rates, stay at their end."""
+    """Whether this stage continues the one before: it begins with its last state, Adam's moments included, and all
+    schedules, such as learning rates, stay at their end."""
 
     @property
     def statistic(self) -> Statistic | None:
