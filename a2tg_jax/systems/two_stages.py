@@ -68,7 +68,8 @@ class TwoStages(System):
         length = self.stage1_iterations
         if floaters.min_views or floaters.near:
             growing = [event for event in events if isinstance(event, StepEvent) and event.most_gaussians is not None]
-            growths = [times for times in (event.times(length) for event in growing) if times.num_times]
+            growths = [event.times(length) for event in growing]
+            growths = [times for times in growths if times.num_times]
             if growths:
                 last = max(growths, key=lambda times: times.last_time)
                 floaters = dataclasses.replace(floaters, at=during_growth(floaters.at, length, last))
