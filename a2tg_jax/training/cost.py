@@ -24,15 +24,24 @@ MB = 10**6
 PROCESS = 300 * MB
 """Python, JAX and other imports."""
 # Rounded to fit the runs in experiments/NOTEBOOK.md, "Forecasts of memory".
-FIRST_PROGRAM, FURTHER_STAGE, FURTHER_PROGRAM = 270 * MB, 110 * MB, 25 * MB
-"""Memory of compiled programs: of the first stage, of each further one, and of each program of new shapes."""
+FIRST_PROGRAM = 270 * MB
+"""Memory of the compiled programs of the first stage."""
+FURTHER_STAGE = 110 * MB
+"""Memory of the compiled programs of each further stage."""
+FURTHER_PROGRAM = 25 * MB
+"""Memory of each program of new shapes."""
 COMPILER = 240 * MB
 """Memory of the compiler during a step's compilation."""
 STATES = 3
 """Parameters and the two moments of Adam."""
-STEP_PER_MODEL, STEP_PER_ROW, STEP_PER_PIXEL, STEP_PER_PAIR = 2.9, 300, 123, 4
-"""Bytes of a step's own buffers: for each byte of the model (gradients and the new state), row (splats), pixel
-(colours, loss, and the gradients of both) and pair (tile lists)."""
+STEP_PER_MODEL = 2.9
+"""Bytes of a step's own buffers for each byte of the model: gradients and the new state."""
+STEP_PER_ROW = 300
+"""The same for each row: splats."""
+STEP_PER_PIXEL = 123
+"""The same for each pixel: colours, loss, and the gradients of both."""
+STEP_PER_PAIR = 4
+"""The same for each pair of the tile lists."""
 GEOMETRY_PER_PIXEL = 72
 """Further bytes if a term of the loss reads depth or normals."""
 STATISTIC_PER_ROW = 480
@@ -40,14 +49,18 @@ STATISTIC_PER_ROW = 480
 CORRECTION_COPIES = 8
 """Copies of the rows of a correction: what the stage began with, rows and moments before and after a step, gradients.
 """
-VIEW_PER_ROW, VIEW_PER_PIXEL = 140, 5
-"""Bytes of each view of a batch, without its gradient of the model."""
+VIEW_PER_ROW = 140
+"""Bytes of each view of a batch for each row, without its gradient of the model."""
+VIEW_PER_PIXEL = 5
+"""The same for each pixel."""
 PAIRS_PER_TILE = 90
 """Room in the tile lists of a stage that begins with few, large Gaussians."""
 DECODER_PER_PIXEL = 15
 """Bytes while a photograph is read."""
-SECONDS_PER_ROW, SECONDS_PER_PIXEL = 2.4e-6, 0.72e-6
-"""Seconds of an iteration on one core (docs/performance.md), shared by all cores."""
+SECONDS_PER_ROW = 2.4e-6
+"""Seconds of an iteration on one core (docs/performance.md) for each row; all cores share them."""
+SECONDS_PER_PIXEL = 0.72e-6
+"""The same for each pixel."""
 
 
 class Bytes(NamedTuple):
@@ -113,19 +126,18 @@ def forecast_stages(
     stages = stages[first:]
     floats = 0.0
     shared = 0
-    shown = None
+    appearance = None
     if num_given is not None:
         num = num_given
         stages = stages[1:]
         yield StageForecast(Bytes(), system.initial_bytes * num, num, num_programs=0, seconds=0, whole_bytes=0)
     for stage in stages:
         num = rows_needed(stage, num, system)
-        if stage.appearance != shown:
+        if stage.appearance != appearance:
             floats = stage.floats_shown(system.initial_sh_degree)
-            shown = stage.appearance
+            appearance = stage.appearance
             shared = stage.shared_bytes
-        own = floats_per_gaussian(system.initial_sh_degree) + floats
-        model_bytes = BYTES_PER_FLOAT * own * num + shared
+        model_bytes = BYTES_PER_FLOAT * (floats_per_gaussian(system.initial_sh_degree) + floats) * num + shared
         for event in stage.events:
             model_bytes = event.most_bytes(model_bytes, num, stage.iterations)
         floats = (model_bytes - shared) / BYTES_PER_FLOAT / num - floats_per_gaussian(system.initial_sh_degree)
@@ -156,21 +168,21 @@ def check_rows_fit(
     limit = allowed_memory(max_memory, devices.each)
     copies = STATES + 1
     forecasts = forecast_stages(scene, system, first=first, num_start=num_start)
-    for stage, found in zip(system.all_stages()[first:], forecasts, strict=True):
-        needed = copies * found.model_bytes
+    for stage, forecast in zip(system.all_stages()[first:], forecasts, strict=True):
+        needed = copies * forecast.model_bytes
         if needed <= limit:
             continue
         names = " or ".join(system.limits())
         if system.memory_budget is not None:
             names += f" of {system.memory_budget:,.15g} MB"
-        elif num_start is not None and found.num_rows == num_start:
+        elif num_start is not None and forecast.num_rows == num_start:
             names = "start"
         place = "this machine (its container and ulimit included)" if default_platform() == "cpu" else "the GPU"
         raise ValueError(
-            f"{names} is too large for {place}: stage {stage.name!r} trains up to {found.num_rows:,} Gaussians of "
-            f"{found.model_bytes / found.num_rows:,.0f} bytes, and {copies} copies of them (parameters, gradients and "
-            f"two moments) take at least {in_bytes(needed)} of memory, but {in_bytes(limit)} may be used: lower it, to "
-            f"a model of less than {in_bytes(limit / copies)}, or allow more with max_memory"
+            f"{names} is too large for {place}: stage {stage.name!r} trains up to {forecast.num_rows:,} Gaussians of "
+            f"{forecast.model_bytes / forecast.num_rows:,.0f} bytes, and {copies} copies of them (parameters, "
+            f"gradients and two moments) take at least {in_bytes(needed)} of memory, but {in_bytes(limit)} may be "
+            f"used: lower it, to a model of less than {in_bytes(limit / copies)}, or allow more with max_memory"
         )
 
 

@@ -1,6 +1,7 @@
 """Training from photographs: the stages of a system, each from the result of the one before."""
 
 import dataclasses
+import functools
 import os
 import warnings
 from typing import Any
@@ -55,7 +56,7 @@ class FitResult(NamedFields):
     stages: tuple[StageResult, ...]
     """Stages that were trained; if training was resumed in a later stage, the earlier ones are missing."""
     checkpoint: Checkpoint | None = None
-    """State at the end, in the memory of the host: three times as large as the model, for `more`."""
+    """State at the end, for `more`, in the memory of the host: three times as large as the model."""
 
     def more(self, scene: Scene, iterations: int, **options: Any) -> "FitResult":
         """Continue the last stage for further iterations.
@@ -95,10 +96,7 @@ class FitResult(NamedFields):
     @property
     def history(self) -> History:
         """History of all stages."""
-        first, *others = (stage.history for stage in self.stages)
-        for other in others:
-            first = first.followed_by(other)
-        return first
+        return functools.reduce(History.followed_by, (stage.history for stage in self.stages))
 
     @property
     def seconds(self) -> float:
@@ -179,7 +177,7 @@ def fit(
         if start is not None:
             raise ValueError("start and resume are both given, but a checkpoint has its own model: leave out start")
         first = resume.stage
-        # Nothing is left of a finished stage that the next one continues.
+        # A finished stage is not resumed if the next one continues it.
         if first + 1 < len(stages) and stages[first + 1].continues and resume.is_at_end:
             first += 1
         check_resume(resume, system, first)
@@ -221,14 +219,14 @@ def _check_arguments(
         example = f"use {path}_scene()" if path in BUILT_IN else f"use load_scene({path!r})"
     check_kind("scene", scene, Scene, example)
     if not isinstance(system, System):
-        found = kind_of(system)
+        kind = kind_of(system)
         example = ""
         if isinstance(system, str):
-            found = "a name"
+            kind = "a name"
             example = f": use find_system({shortened(system)!r}).preset('quick')"
         elif isinstance(system, type) and issubclass(system, System):
             example = f": use {system.__name__}() or {system.__name__}.preset('quick')"
-        raise ValueError(f"system must be a System; got {found}{example}")
+        raise ValueError(f"system must be a System; got {kind}{example}")
     if resume is not None:
         check_kind("resume", resume, Checkpoint, "use load_checkpoint(path)" if isinstance(resume, is_path) else "")
     if start is not None:
@@ -240,7 +238,7 @@ def _check_arguments(
             StageResult: "use result.model",
             Checkpoint: "give it as resume",
         }
-        hint = next((text for kind, text in hints.items() if isinstance(start, kind)), "")
+        hint = next((text for cls, text in hints.items() if isinstance(start, cls)), "")
         check_kind("start", start, Model, hint)
     if checkpoint_every is not None and checkpoint_every < 1:
         raise ValueError(f"checkpoint_every must be at least 1; got {checkpoint_every}")
@@ -332,13 +330,13 @@ def warn_of_budget(system: System, model: Model) -> None:
     """Warn if a finished model does not fill its memory budget or exceeds it."""
     budget = system.budget_bytes
     used = model.num_bytes
-    one = (used - model.bytes_of(0)) / model.num
+    bytes_each = (used - model.bytes_of(0)) / model.num
     if budget is None or budget * (1 - LARGEST_SHORTFALL) <= used <= budget:
         return
     if used > budget:
         advice = f"compose the stages of {type(system).__name__} with System.budget_cap"
-    elif used + one > budget:
-        advice = f"there is no room for another Gaussian of {one:,.0f} bytes: raise memory_budget"
+    elif used + bytes_each > budget:
+        advice = f"there is no room for another Gaussian of {bytes_each:,.0f} bytes: raise memory_budget"
     else:
         advice = f"raise {system.more_growth()}"
     share = f"{used / budget:.1%} of the memory_budget of {budget:,}"
