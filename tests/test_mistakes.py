@@ -62,7 +62,7 @@ COMMANDS = {
     "train --out new": "SCENE",
     "train synthetic more --out new": "Unrecognized … more",
     f"{NEW} --texture.fracton 0.5": "--texture.fraction",
-    f"{NEW} --sytem bytewise": "a2tg train has no option --sytem; did you mean --system?",
+    f"{NEW} --sytem bytewise": "--sytem … --system NAME",
     "convert a.ply b.ply --bake --bake-growth 0.5": "--bake-growth … at least 1 … got 0.5",
     "convert a.ply b.ply --bake --bake-iterations -1": "--bake-iterations … at least 0 … got -1",
     "convert a.ply b.ply --bake-iterations 0": "--bake-iterations … --bake",

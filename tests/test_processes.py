@@ -1,7 +1,6 @@
 """Several processes that train together: those of this machine (`on_processes`), and connections without a training."""
 
 import dataclasses
-import os
 import signal
 import socket
 import threading
@@ -239,30 +238,3 @@ def test_a_lack_of_memory_is_no_lost_connection():
 def test_wrong_places_are_reported(tmp_path, capsys, flags, printed):
     assert cli.main(["train", "synthetic", "--out", str(tmp_path / "run"), *flags.split()]) == 2
     assert printed in capsys.readouterr().err
-
-
-@pytest.mark.long
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes cannot fork here")
-def test_a_forked_child_says_what_to_do_where_it_would_hang():
-    """Before JAX starts anything, a fork is fine: the program is itself a child."""
-    code = """
-import os, warnings
-import a2tg_jax.training as _, a2tg_jax as a2tg
-if os.fork():
-    os._exit(os.waitstatus_to_exitcode(os.wait()[1]))
-scene, system = a2tg.synthetic_scene(num_views=3, width=16, height=12), a2tg.Gaussians2d.preset("smoke")
-model, view = a2tg.Model(a2tg.init_from_points(scene.points, scene.colors, num=9)), scene.train[0]
-print(model.render(view.camera).color.shape, flush=True)
-warnings.simplefilter("ignore", RuntimeWarning)  # JAX warns of each fork
-if not os.fork():
-    for call in "model.render(view.camera)", "a2tg.evaluate([view], model)", "a2tg.fit(scene, system)":
-        try:
-            eval(call)
-        except RuntimeError as error:
-            print(error, flush=True)
-    os._exit(0)
-os.wait()
-"""
-    rendered, *printed = started(["-c", code]).communicate(timeout=60)[0].splitlines()
-    assert rendered == "(12, 16, 3)" and len(printed) == 3
-    assert all("waits for its threads forever: start processes by spawn" in line for line in printed)

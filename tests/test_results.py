@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from run_folders import NAMES, RECORD, circle, create_run, some_history, some_result, tensorboard_scalars
+from small_models import with_row
 
 import a2tg_jax as a2tg
 from a2tg_jax.adapt import Upscale
@@ -681,8 +682,8 @@ def test_one_line_says_what_the_photographs_allow(train, ending):
 
 def test_history_round_trip_with_loss_terms(tmp_path):
     """One of two stages has a term that the other lacks."""
-    one = some_history(num=2).with_point(1, 3, 0.3, 20.0, 5, 0.1, 2.0, l1=0.25, roughness=0.05)
-    both = one.followed_by(some_history(num=1).with_point(2, 2, 0.2, 20.0, 5, 0.1, 2.0, l1=0.2))
+    one = with_row(some_history(num=2), 1, 3, 0.3, 20.0, 5, 0.1, 2.0, l1=0.25, roughness=0.05)
+    both = one.followed_by(with_row(some_history(num=1), 2, 2, 0.2, 20.0, 5, 0.1, 2.0, l1=0.2))
     for history in (some_history(), both):
         write_history(tmp_path / "h.csv", history)
         found = read_history(tmp_path / "h.csv").to_dict()
@@ -706,7 +707,7 @@ def written_for_tensorboard(run, *histories, skipped=None):
 def test_tensorboard_gets_each_row_once(tmp_path):
     """A file has the new rows of each call; another process adds the rows after the checkpoint."""
     run = RunFolder(tmp_path)
-    wanted = some_history(num=9).with_point(1, 10, 0.3, 20.0, 5, 0.1, 2.0, l1=0.25)
+    wanted = with_row(some_history(num=9), 1, 10, 0.3, 20.0, 5, 0.1, 2.0, l1=0.25)
     written_for_tensorboard(run, some_history(num=3), some_history(num=3), some_history(num=7))
     written_for_tensorboard(run, wanted, skipped=some_history(num=7))
     found = tensorboard_scalars(run.tensorboard)

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from typing import Any
 
-from a2tg_jax.cli.flags import FLAGS
 from a2tg_jax.host import signals
 from a2tg_jax.host.errors import error_text
 from a2tg_jax.host.machine import check_ulimits
@@ -54,8 +53,6 @@ COMMANDS = {
     "sfm": "inputs:Sfm", "download": "inputs:Download", "doctor": "doctor:Doctor",
 }  # fmt: skip
 """Module of `a2tg_jax.cli` and dataclass of each command."""
-CONVERTED = ("ply", "sog", "spz", "splat", "ksplat", "glb", "gltf", "usdz", "usda", "usdc", "npz", "a2tgz")
-"""Suffixes of files that convert writes, tried as flags of export. `io.formats` has them too, but imports JAX."""
 WITHOUT_JAX = frozenset({"sfm", "download"})
 """Commands that do not start JAX."""
 HELP = frozenset({"-h", "--help", "--help-all"})
@@ -81,8 +78,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name not in (*COMMANDS, "-h", "--help", "--version"):
         near = did_you_mean(name, COMMANDS)
         return _fail(f"there is no command {name!r}{near or ';'} the commands are {', '.join(COMMANDS)}")
-    if name in COMMANDS and (error := _misspelt_flag(name, arguments)):
-        return _fail(error)
     try:
         if name not in COMMANDS:
             print(version("a2tg-jax") if name == "--version" else OVERVIEW, flush=True)
@@ -129,26 +124,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         is_typed = any(word.partition("=")[0] == flag for word in arguments)
         return _fail(f"{flag}{space}{rest}" if is_typed else text)
     return 0
-
-
-def _misspelt_flag(name: str, arguments: Sequence[str]) -> str | None:
-    """Return an error for the first flag that a command lacks; None if there is none, or custom systems may have it."""
-    known = {"help", "help-all", *FLAGS[name].split()}
-    given = [word.partition("=")[0][2:].replace("_", "-") for word in arguments if word.startswith("--")]
-    # A configuration file may name one.
-    is_custom = {"config", "resume"} & set(given) or any(":" in word for word in arguments)
-    if name == "train" and is_custom:
-        return None
-    for flag in given:
-        if flag not in known and re.sub(r"(^|\.)no-", r"\1", flag) not in known:
-            if name == "export" and flag in CONVERTED:
-                return f"a2tg export has no option --{flag}: a2tg convert writes such files, by the suffix of OUT"
-            # Of a group first, such as densify.cap for cap.
-            within = sorted(each for each in known if each.endswith(f".{flag}"))
-            near = f"; did you mean {' or '.join(within)}?" if within else did_you_mean(flag, known)
-            hint = re.sub(r"(mean|or) ", r"\1 --", near) if near else f"; a2tg {name} --help lists them"
-            return f"a2tg {name} has no option --{flag}{hint}"
-    return None
 
 
 def command_class(name: str) -> Any:
