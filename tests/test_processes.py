@@ -22,8 +22,9 @@ from a2tg_jax.io.archive import write_archive
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.parallel import processes
 from a2tg_jax.parallel.processes import LOST, Liveness, accept, connect, is_of_collectives, listen
-from a2tg_jax.results import run_training
-from a2tg_jax.results.folder import RunFolder, resuming_command
+from a2tg_jax.results import run_processes
+from a2tg_jax.results.folder import RunFolder
+from a2tg_jax.results.commands import resuming_command
 from a2tg_jax.results.history import read_history
 from a2tg_jax.results.record import RunRecord, SceneSource, read_record, write_record
 from a2tg_jax.training import Session, fit_stage
@@ -183,10 +184,10 @@ def test_digests_differ_where_training_would():
         """Whether options, devices and scene have other digests."""
         views = dataclasses.replace(view, **dict(own)), *scene.train[1:]
         changed = dataclasses.replace(scene, train=views, **changes)
-        found = run_training.digests_of(record, changed, session)
+        found = run_processes.digests_of(record, changed, session)
         return [a != b for a, b in zip(found, wanted, strict=True)]
 
-    wanted = run_training.digests_of(record, scene, Session())
+    wanted = run_processes.digests_of(record, scene, Session())
     assert differ(dataclasses.replace(record, scene=SceneSource("there"))) == [False] * 3
     camera = dataclasses.replace(view.camera, viewmat=view.camera.viewmat + np.float32(1e-6))
     fisheye = dataclasses.replace(view.camera, rays=np.zeros((*size, 2), np.float32))

@@ -33,30 +33,14 @@ from a2tg_jax.measure.evaluation import evaluate
 from a2tg_jax.measure.metrics import psnr
 from a2tg_jax.model import Model
 from a2tg_jax.render import render_image
-from a2tg_jax.results.folder import (
-    OLD,
-    RunFolder,
-    check_export,
-    check_free,
-    check_new,
-    check_output,
-    drop_old,
-    open_run,
-    set_aside,
-)
+from a2tg_jax.results.commands import repeating_command
+from a2tg_jax.results.folder import OLD, RunFolder, check_free, drop_old, open_run, set_aside
 from a2tg_jax.results.history import EventWriter, read_history, write_history
 from a2tg_jax.results.images import to_uint8
 from a2tg_jax.results.info import describe_run
-from a2tg_jax.results.record import (
-    RunRecord,
-    SceneSource,
-    contradictions,
-    plan_run,
-    read_record,
-    read_run_file,
-    repeating_command,
-    write_record,
-)
+from a2tg_jax.results.output_paths import check_export, check_new, check_output
+from a2tg_jax.results.plan import plan_run
+from a2tg_jax.results.record import RunRecord, SceneSource, contradictions, read_record, read_run_file, write_record
 from a2tg_jax.results.report import (
     bytes_compared,
     metrics_json,
@@ -190,15 +174,14 @@ def test_places_that_cannot_be_written_are_named(tmp_path):
             check_output(Path("/proc/x"))
 
 
-def test_new_folders_on_several_levels_elsewhere_are_reported(tmp_path, monkeypatch, capsys):
+def test_new_folders_on_several_levels_elsewhere_are_reported(tmp_path, monkeypatch):
     for path in (tmp_path, tmp_path / "run"):
         check_output(path)
-    assert capsys.readouterr().err == ""
-    check_output(tmp_path / "usb stick" / "runs" / "run")
-    assert capsys.readouterr().err == f"a2tg: {tmp_path / 'usb stick'} does not exist and will be made\n"
+    with pytest.warns(UserWarning, match=f"^{re.escape(str(tmp_path / 'usb stick'))} does not exist and will be made$"):
+        check_output(tmp_path / "usb stick" / "runs" / "run")
     monkeypatch.chdir(tmp_path)
     check_output(Path("runs/demo"))
-    assert capsys.readouterr().err == "" and not list(tmp_path.iterdir())
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_budget_for_few_gaussians_is_reported():
@@ -718,7 +701,7 @@ def test_tensorboard_gets_each_row_once(tmp_path):
         steps, values = zip(*found[f"{column}/a2tg-gaussians"], strict=True)
         assert steps == (*range(1, 11),)
         np.testing.assert_allclose(values, getattr(wanted, column), rtol=1e-6)
-    assert sorted(run.own_files(run.written())) == sorted(run.tensorboard.iterdir())
+    assert sorted(run.files()) == sorted(run.tensorboard.iterdir())
     run.clear()
     assert not run.tensorboard.exists()
 

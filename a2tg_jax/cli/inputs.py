@@ -15,9 +15,9 @@ from a2tg_jax.data.sfm import CameraModel, Matching, run_sfm
 from a2tg_jax.data.staging import Panorama
 from a2tg_jax.data.video import DEFAULT_FRAMES
 from a2tg_jax.host.text import defaulting_to, did_you_mean
+from a2tg_jax.results.commands import quick_flags
 from a2tg_jax.results.figures import save_camera_picture
-from a2tg_jax.results.folder import check_apart, check_output
-from a2tg_jax.results.forecast import quick_flags
+from a2tg_jax.results.output_paths import check_apart, check_output
 
 
 @dataclasses.dataclass(frozen=True)

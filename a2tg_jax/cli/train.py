@@ -26,8 +26,8 @@ from a2tg_jax.host.text import counted, defaulting_to
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.parallel import AUTO, ProcessPlace, joined
-from a2tg_jax.results.compression import command_for_file
-from a2tg_jax.results.folder import RunFolder, open_run, opened, resuming_command
+from a2tg_jax.results.commands import file_command, resuming_command
+from a2tg_jax.results.folder import RunFolder, open_run, opened
 from a2tg_jax.results.forecast import room_for_photographs
 from a2tg_jax.results.history import tensorboard_library
 from a2tg_jax.results.record import (
@@ -39,7 +39,8 @@ from a2tg_jax.results.record import (
     write_record,
 )
 from a2tg_jax.results.report import RunResult, sizes_line, summary_text
-from a2tg_jax.results.run_training import RunOptions, begin_run, follow_first_process, resume_run, unseen, warn
+from a2tg_jax.results.run_processes import follow_first_process
+from a2tg_jax.results.run_training import RunOptions, begin_run, resume_run, unseen, warn
 from a2tg_jax.results.viewing import shown_live
 from a2tg_jax.systems.a2tg import A2tg
 from a2tg_jax.training import Session
@@ -240,7 +241,7 @@ class Train:
         """
         kept = read_record(run)
         if (size := self.record.file_budget) != kept.file_budget:
-            other = command_for_file(run, f"{size}MB" if size else "SIZE")
+            other = file_command(run, f"{size}MB" if size else "SIZE")
             raise ValueError(f"--file-budget is for new runs; for another file of a finished one: {other}")
         record = self.whole_record
         more, options = record.options.more, dataclasses.replace(record.options, more=kept.options.more)

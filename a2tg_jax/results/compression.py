@@ -44,8 +44,9 @@ from a2tg_jax.io.formats import FORMATS
 from a2tg_jax.io.model_rows import check_encodable
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderSettings
-from a2tg_jax.results.folder import RunFolder, check_export, check_output
+from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.model_source import open_source
+from a2tg_jax.results.output_paths import check_export, check_output
 from a2tg_jax.results.report import aligned, loss_text
 from a2tg_jax.results.run_evaluation import refined_views
 from a2tg_jax.training import System
@@ -170,7 +171,7 @@ def compress(
     return "\n".join([*lines, size])
 
 
-def command_for_file(run: RunFolder, size: str) -> str:
+def file_command(run: RunFolder, size: str) -> str:
     """Return the command line that writes the tuned file of a size of a finished run."""
     flags = ["--file-budget", size, "--tune-iterations", str(ITERATIONS)]
     return shlex.join(["a2tg", "compress", str(run.path), *flags])

@@ -29,8 +29,9 @@ from a2tg_jax.io.other_programs import World, world_line
 from a2tg_jax.io.ply import save_ply
 from a2tg_jax.io.sog import HEADER
 from a2tg_jax.model import Model
-from a2tg_jax.results.folder import RunFolder, check_new, check_output
+from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.model_source import Source, open_source
+from a2tg_jax.results.output_paths import check_new, check_output
 
 
 @dataclasses.dataclass(frozen=True)

@@ -16,8 +16,8 @@ from a2tg_jax.host.text import did_you_mean
 from a2tg_jax.io.edit_file import Edit, apply_edit, crop_box, save_edit
 from a2tg_jax.model import Model
 from a2tg_jax.results.conversion import check_conversion, write_converted
-from a2tg_jax.results.folder import check_new, check_output
 from a2tg_jax.results.model_source import open_source
+from a2tg_jax.results.output_paths import check_new, check_output
 
 AXES = dict(zip("xyz", np.eye(3), strict=True))
 AXES |= {f"-{name}": -axis for name, axis in AXES.items()}

@@ -24,9 +24,10 @@ from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.io.path_file import load_views
 from a2tg_jax.model import Model
 from a2tg_jax.renderer import Renderer
-from a2tg_jax.results.folder import RunFolder, check_new
+from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.images import picture_names, save_animation, to_uint8, write_png
 from a2tg_jax.results.model_source import open_source
+from a2tg_jax.results.output_paths import check_new
 
 Route = Literal["test", "smooth", "orbit"]
 FLIGHT_SIZE = (1280, 720)

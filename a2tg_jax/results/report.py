@@ -21,10 +21,12 @@ from a2tg_jax.host.source_commit import source_commit
 from a2tg_jax.host.text import in_bytes
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.measure.evaluation import Evaluation
+from a2tg_jax.results.commands import repeating_command, training_command
 from a2tg_jax.results.figures import ReportFigure
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.images import file_uri, jpeg_uri
-from a2tg_jax.results.record import RunPlan, RunRecord, repeating_command, training_command
+from a2tg_jax.results.plan import RunPlan
+from a2tg_jax.results.record import RunRecord
 
 QUALITIES = (("PSNR (dB)", "psnr", 2), ("SSIM", "ssim", 4), ("LPIPS", "lpips", 4))
 """Rows of the summary: name, metric, and decimals."""

@@ -29,9 +29,10 @@ from a2tg_jax.io.other_programs import matrix_of
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.model import Model
 from a2tg_jax.results.compression import loss_measures
-from a2tg_jax.results.folder import check_new, remove_if_empty
+from a2tg_jax.results.folder import remove_if_empty
 from a2tg_jax.results.images import to_uint8
 from a2tg_jax.results.model_source import Source
+from a2tg_jax.results.output_paths import check_new
 from a2tg_jax.results.report import loss_text
 from a2tg_jax.training.loop import IsStopped, StageRun
 from a2tg_jax.training.stage import BACKGROUNDS
