@@ -199,7 +199,9 @@ class Train:
         Raises:
           ValueError: if flags of several processes are missing or wrong, or exclude each other.
         """
-        number, index, seconds = self.num_processes, self.process_id, self.heartbeat_timeout_seconds
+        number = self.num_processes
+        index = self.process_id
+        seconds = self.heartbeat_timeout_seconds
         values = {"--num-processes": number, "--process-id": index}
         if self.coordinator is None:
             for flag, value in {**values, "--heartbeat-timeout-seconds": seconds}.items():
@@ -208,7 +210,8 @@ class Train:
             return None
         if self.view:
             raise ValueError("--view shows the training of one process: leave out --view or --coordinator")
-        seconds = HEARTBEAT_TIMEOUT if seconds is None else seconds
+        if seconds is None:
+            seconds = HEARTBEAT_TIMEOUT
         if not 0 < seconds < math.inf:
             raise ValueError(f"--heartbeat-timeout-seconds must be positive and finite; got {seconds:g}")
         if self.coordinator != AUTO:
@@ -217,9 +220,10 @@ class Train:
                 raise ValueError(f"--coordinator HOST:PORT also needs {' and '.join(missing)}")
             if not ADDRESS.fullmatch(self.coordinator):
                 raise ValueError(f"--coordinator must be HOST:PORT, [IPv6]:PORT or auto; got {self.coordinator!r}")
-        for flag, value, least in (("--num-processes", number, 1), ("--process-id", index, 0)):
-            if value is not None and value < least:
-                raise ValueError(f"{flag} must be at least {least}; got {value}")
+        if number is not None and number < 1:
+            raise ValueError(f"--num-processes must be at least 1; got {number}")
+        if index is not None and index < 0:
+            raise ValueError(f"--process-id must be at least 0; got {index}")
         if number is not None and index is not None and index >= number:
             raise ValueError(f"--process-id must be from 0 to {number - 1}, one less than --num-processes; got {index}")
         return ProcessPlace(self.coordinator, number, index, seconds)
@@ -240,12 +244,12 @@ class Train:
           ValueError: if a flag contradicts the record.
         """
         kept = read_record(run)
-        if (size := self.record.file_budget) != kept.file_budget:
-            other = file_command(run, f"{size}MB" if size else "SIZE")
-            raise ValueError(f"--file-budget is for new runs; for another file of a finished one: {other}")
-        record = self.whole_record
-        more, options = record.options.more, dataclasses.replace(record.options, more=kept.options.more)
-        record = dataclasses.replace(record, options=options)
+        size = self.record.file_budget
+        if size != kept.file_budget:
+            another = file_command(run, f"{size}MB" if size else "SIZE")
+            raise ValueError(f"--file-budget is for new runs; for another file of a finished one: {another}")
+        more = self.record.options.more
+        record = self.whole_record.with_options(more=kept.options.more)
         changed = [f"--{name.replace('_', '-')}" for name in contradictions(record, kept)]
         if is_first and record.scene.path != kept.scene.path:
             changed.insert(0, f"{record.scene.path}, as it was trained on {kept.scene.path}")
@@ -258,8 +262,7 @@ class Train:
             raise ValueError(f"--more trains a finished run on: first finish this one with {resuming_command(run)}")
         if more and self.coordinator is not None:
             raise ValueError("--more with --resume is for one process: leave out --coordinator")
-        options = dataclasses.replace(options, more=(*options.more, *more))
-        record = dataclasses.replace(record, options=options)
+        record = record.with_options(more=(*kept.options.more, *more))
         record.check()
         if is_first and record != kept:
             write_record(run, record)
@@ -296,7 +299,7 @@ def train_defaults(arguments: Sequence[str]) -> Train:
         with contextlib.nullcontext(open_run(Path(found.out))) if found.coordinator else opened(Path(found.out)) as run:
             record = read_record(run)
             # Those that are given are added, so that the same number may be given twice.
-            record = dataclasses.replace(record, options=dataclasses.replace(record.options, more=()))
+            record = record.with_options(more=())
     elif found.config:
         record = read_run_file(Path(found.config))
     # A resumed run keeps its system and preset; `resumed` reports other ones.
@@ -310,9 +313,9 @@ def train_defaults(arguments: Sequence[str]) -> Train:
 def defaults_line(arguments: Sequence[str]) -> str:
     """Return the most important defaults of the given system and preset."""
     record = train_defaults(arguments).record
-    options, system = flatten_config(record.options), record.system
-    found = [f"--{name.replace('_', '-')} {options[name]}" for name in IMPORTANT if name in options]
-    return f"Defaults of {system} with the preset {record.preset or 'paper'}: {' '.join(found)}"
+    options = flatten_config(record.options)
+    flags = [f"--{name.replace('_', '-')} {options[name]}" for name in IMPORTANT if name in options]
+    return f"Defaults of {record.system} with the preset {record.preset or 'paper'}: {' '.join(flags)}"
 
 
 def resume(folder: Path, options: RunOptions, check: Callable[[RunFolder], object] = lambda run: None) -> None:
@@ -343,7 +346,7 @@ def with_view_for_each(record: RunRecord, num_devices: int) -> RunRecord:
     """Return the record with as many views a step as there are devices, unless it has another number than one."""
     if num_devices == 1 or record.options.batch_size > 1:
         return record
-    return dataclasses.replace(record, options=dataclasses.replace(record.options, batch_size=num_devices))
+    return record.with_options(batch_size=num_devices)
 
 
 def devices_named(text: str) -> list[jax.Device] | None:
@@ -356,11 +359,15 @@ def devices_named(text: str) -> list[jax.Device] | None:
     if text == "all":
         text = str(len(devices))
     if not text.isdecimal() or not 1 <= int(text) <= len(devices):
-        found = f"this machine has {counted(len(devices), f'{devices[0].platform.upper()} device')}"
-        raise ValueError(f"--devices must be all, or a number from 1 to {len(devices)}; got {text!r}: {found}")
+        kind = devices[0].platform.upper()
+        raise ValueError(
+            f"--devices must be all, or a number from 1 to {len(devices)}; got {text!r}: this machine has "
+            f"{counted(len(devices), f'{kind} device')}"
+        )
     # By process, so that all have the same list.
-    by_process = [jax.local_devices(process_index=index) for index in range(jax.process_count())]
-    chosen = [device for own in by_process for device in own[: int(text)]]
+    chosen: list[jax.Device] = []
+    for index in range(jax.process_count()):
+        chosen += jax.local_devices(process_index=index)[: int(text)]
     return chosen if len(chosen) > 1 else None
 
 
