@@ -63,7 +63,8 @@ def parse(kind: type[Parsed], program: str, arguments: Sequence[str], default: P
     about = inspect.getdoc(kind) or ""
     given: dict[str, Any] = {}
     if default is not None:
-        about, given = about.split("\n")[0], {"default": default}  # The other lines are the short help.
+        about = about.split("\n")[0]  # The other lines are the short help.
+        given["default"] = default
     command: Parsed = tyro.cli(kind, prog=program, args=arguments, description=about, registry=rules, **given)
     scene = getattr(getattr(getattr(command, "record", None), "scene", None), "path", None)
     for word in arguments:
