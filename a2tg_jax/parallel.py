@@ -8,6 +8,7 @@ and the gradients of all views to the device that has the row, which sums them i
 A mesh of None is one device, on which these functions return what they are given.
 """
 
+import atexit
 import contextlib
 import os
 import sys
@@ -237,12 +238,18 @@ def joined(place: ProcessPlace | None, advice: Callable[[], str]) -> Iterator[No
         leave()
     except Exception as error:
         if not is_lost(error):
+            # Before JAX's own function at the exit of Python, which would wait for the others and then abort.
+            atexit.register(_exit, 2 if isinstance(error, ValueError | OSError) else 1)
             raise
         print(f"a2tg: error: another process was lost: {shortened(str(error), 200)}; {advice()}", file=sys.stderr)
-        sys.stdout.flush()
-        sys.stderr.flush()
-        # Not `sys.exit`: JAX would wait for the others.
-        os._exit(LOST)
+        _exit(LOST)
+
+
+def _exit(code: int) -> None:
+    """End the process without a word to the others, which JAX ends in turn."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
 
 
 def leave() -> None:

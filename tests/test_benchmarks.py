@@ -39,14 +39,24 @@ def test_the_table_of_gpus_is_current():
     assert gpu_table(report) in (root / "docs" / "performance.md").read_text()
 
 
-@pytest.mark.long
-def test_devices_share_the_pairs_of_an_image_with_a_sky():
-    found = scaling.counted(3000, 4, 1, has_sky=True)
-    assert found["fullest_band"] < 1.15 < 1.5 < found["fullest_of_even_bands"] < 4
-    assert found["least_bytes"] <= found["row_bytes"] < found["row_bytes_of_even_bands"]
-    assert 0 < found["pixel_bytes"] < 2 * 4 * scaling.CHANNELS * scaling.WIDTH * scaling.HEIGHT * 3
-    alone = scaling.counted(3000, 4, 4, has_sky=True)
-    assert alone["fullest_band"] == 1 and alone["pixel_bytes"] == 0, "a view for each device"
+def test_bytes_sent_are_those_of_collectives_of_each_step():
+    program = """HloModule jit_step
+
+%event (x: f32[8,3]) -> f32[8,3] {
+  ROOT %gathered = f32[8,3]{1,0} all-gather(%x), dimensions={0}
+}
+
+%part (x: f32[2,3]) -> f32[8,3] {
+  ROOT %gathered = f32[8,3]{1,0} all-gather(%x), dimensions={0}
+}
+
+ENTRY %main (x: f32[2,3]) -> f32[8,3] {
+  %all = f32[8,3]{1,0} call(%x), to_apply=%part
+  %moved = (f32[1,2]{1,0}, pred[4]{0}) all-to-all(%a, %b), dimensions={0}
+  ROOT %changed = f32[8,3]{1,0} conditional(%is_due, %all, %all), branch_computations={%event, %event}
+}
+"""
+    assert scaling.bytes_sent(program, 4) == {"all-to-all": 12 * 3 // 4, "all-gather": 96 * 3 // 4}
 
 
 @pytest.mark.long

@@ -12,8 +12,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "a2tg_jax"
 LAYERS = (
     {"host"},
-    {"parallel"},
-    {"core"},
+    {"core", "parallel"},
     {"texture", "data"},
     {"appearance"},
     {"rasterize"},
@@ -30,19 +29,12 @@ LAYERS = (
     {"__main__"},
 )
 """Lowest first. A module may import from lower layers, and, within one subpackage, from itself."""
-DRAWING = {"parallel.exchange", "parallel.exchange_room"}
-"""Modules of `parallel` that belong to the layer of rasterize: how splats reach pixels. The others are arrays only."""
 MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
 
 
 def component(path: Path) -> str:
     """The module or subpackage of the package that a file belongs to."""
-    return component_of(path.relative_to(PACKAGE).with_suffix("").as_posix().replace("/", "."))
-
-
-def component_of(name: str) -> str:
-    """The component of a module, given its dotted path below the package."""
-    return "rasterize" if name in DRAWING else name.split(".")[0]
+    return path.relative_to(PACKAGE).with_suffix("").parts[0]
 
 
 def imported_components(path: Path) -> set[str]:
@@ -58,9 +50,7 @@ def imported_components(path: Path) -> set[str]:
             names = [alias.name for alias in node.names]
         else:
             continue
-        if isinstance(node, ast.ImportFrom) and node.module == "a2tg_jax.parallel":
-            names = [f"a2tg_jax.parallel.{alias.name}" for alias in node.names]
-        found |= {component_of(name.removeprefix("a2tg_jax.")) for name in names if name.startswith("a2tg_jax.")}
+        found |= {name.split(".")[1] for name in names if name.startswith("a2tg_jax.")}
     return found
 
 
@@ -113,6 +103,11 @@ def test_no_modules_import_each_other():
 
     for name in graph:
         visit(name, ())
+
+
+def test_few_modules_know_of_several_devices():
+    found = {dotted(path) for path in MODULES if "parallel" in modules_imported(path)}
+    assert found == {"training.step", "training.loop", "training.batches", "results.run_training", "cli.train"}
 
 
 def test_mathematics_knows_nothing_of_the_host():

@@ -68,7 +68,7 @@ SMALLEST = {
     "large_scene": "--photographs 4 --size 60 40 --downscale 2 --out {out}",
     "meshes": "--num 300 --views 2 --size 32 24 --resolution 12",
     "plots": "benchmarks/results/cpu.json {folder}",
-    "scaling": "--largest 10000 --out {out}",
+    "scaling": "--gaussians 500 --devices 1 --steps 2 --out {out}",
     "tables": "benchmarks/results/cpu.json {folder}/performance.md {folder}/NOTEBOOK.md",
 }
 """Arguments of the scripts of `benchmarks`."""

@@ -98,11 +98,11 @@ class RunForecast:
         )
 
     def check_one_device(self, limit: float) -> None:
-        """Raise ValueError if the finished model and a device's share of the state do not fit on it."""
+        """Raise ValueError if a device has no room for its share of the state, and for all of it between steps."""
         phase, needed = max(self.whole.items(), key=lambda item: item[1], default=("", 0.0))
         if needed > limit:
             raise ValueError(
-                f"the model of {phase} must fit on one device: that takes about {in_bytes(needed)}, and "
+                f"the state of {phase} must fit on one device: that takes about {in_bytes(needed)}, and "
                 f"{in_bytes(limit)} may be used: change {self._options('model')}"
             )
 

@@ -6,14 +6,13 @@ pixel and pair, as XLA reports for compiled steps (`memory_analysis`). The size 
 """
 
 import dataclasses
-import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.gaussians import floats_per_gaussian
 from a2tg_jax.data.scene import Scene, View, ray_bytes
-from a2tg_jax.events import HostEvent, StepEvent
+from a2tg_jax.events import HostEvent
 from a2tg_jax.host.machine import Devices, allowed_memory, default_platform, num_threads
 from a2tg_jax.host.text import in_bytes
 from a2tg_jax.training.batches import plan_batches, view_bytes
@@ -43,8 +42,6 @@ CORRECTION_COPIES = 8
 """
 VIEW_PER_ROW, VIEW_PER_PIXEL = 140, 5
 """Bytes of each view of a batch, without its gradient of the model."""
-TRAVELLING_ROW = 164
-"""Bytes of a row that a device receives, and of its gradient."""
 PAIRS_PER_TILE = 90
 """Room in the tile lists of a stage that begins with few, large Gaussians."""
 DECODER_PER_PIXEL = 15
@@ -88,7 +85,7 @@ class StageForecast:
     seconds: float
     """All its iterations, on CPUs, roughly."""
     whole_bytes: float
-    """Bytes that one of several devices must have room for: its share, and the finished model."""
+    """Bytes that one of several devices must have room for: its share of the state, and, between steps, all of it."""
 
     @property
     def is_trained(self) -> bool:
@@ -130,7 +127,7 @@ def forecast_stages(
         floats = (model_bytes - shared) / BYTES_PER_FLOAT / num - floats_per_gaussian(system.initial_sh_degree)
         on_host = [event for event in stage.events if isinstance(event, HostEvent)]
         programs = 1 + sum(event.num_programs(stage.iterations) for event in on_host)
-        whole = (1 + (STATES + 1) / num_devices) * model_bytes
+        whole = (STATES + STATES / num_devices) * model_bytes
         seconds = stage.iterations * system.batch_size * (SECONDS_PER_ROW * num + SECONDS_PER_PIXEL * mean_pixels)
         needed = stage_bytes(scene, system, stage, num, model_bytes, num_devices)
         yield StageForecast(needed, model_bytes, num, programs, seconds / num_threads(), whole)
@@ -179,26 +176,24 @@ def stage_bytes(
     """Return the bytes of a stage's last steps on all devices, without programs and compilation, given its number of
     rows and the bytes of the model.
 
-    Of the views of a batch, several devices draw G at once, each with room for all its rows and pixels. On CPUs every
-    device has the images of all of them whole, for SSIM.
+    Each of several devices has its share of the state, and, while it draws its views, a copy of the model.
     """
-    at_once = math.gcd(system.batch_size, num_devices)
-    images = at_once * (num_devices if default_platform() == "cpu" else 1)
     is_changed = any(isinstance(event, HostEvent) and event.iterations(stage.iterations) for event in stage.events)
-    largest, batch = largest_view(scene.train), system.batch_size
+    largest, batch = largest_view(scene.train), system.batch_size // num_devices
     per_view = sum(BYTES_PER_FLOAT * correction.neutral.size for correction in stage.corrections)
     per_pixel = STEP_PER_PIXEL + GEOMETRY_PER_PIXEL * stage.has_geometry
     pairs = PAIRS_PER_TILE * largest / system.tile_size**2
     per_row = STEP_PER_ROW + STATISTIC_PER_ROW * any(event.statistic for event in stage.events)
-    of_step = STEP_PER_MODEL * model_bytes + per_row * num + (batch - 1) * (model_bytes + VIEW_PER_ROW * num)
-    of_step += (at_once - 1) * TRAVELLING_ROW * num
-    if any(isinstance(event, StepEvent) and event.most_gaussians is not None for event in stage.events):
-        of_step += (num_devices - 1) * model_bytes  # Rows that move inside a step are gathered on each device.
+    of_step = STEP_PER_MODEL * model_bytes
+    if num_devices > 1:  # The copy and the gradients are of all rows; the rest of a step is divided.
+        of_step = (2 + (STEP_PER_MODEL - 1) / num_devices) * model_bytes
+    of_step += per_row * num + (batch - 1) * (model_bytes + VIEW_PER_ROW * num)
     return Bytes(
-        photographs=held_bytes(scene) + fed_bytes(scene.train, batch, has_depths=stage.has_depths),
+        photographs=held_bytes(scene) + num_devices * fed_bytes(scene.train, batch, has_depths=stage.has_depths),
         model=(STATES + 1) * model_bytes,  # what the stage began with stays
-        gradients=max(of_step, STATES * model_bytes * is_changed),  # An event holds the old state and the new one.
-        pixels=largest * (images * per_pixel + VIEW_PER_PIXEL * (batch - 1)) + at_once * STEP_PER_PAIR * pairs,
+        # An event holds the old state and the new one.
+        gradients=max(num_devices * of_step, STATES * model_bytes * is_changed),
+        pixels=num_devices * (largest * (per_pixel + VIEW_PER_PIXEL * (batch - 1)) + STEP_PER_PAIR * pairs),
         corrections=CORRECTION_COPIES * len(scene.train) * per_view
         + largest * sum(correction.bytes_per_pixel for correction in stage.corrections),
     )
