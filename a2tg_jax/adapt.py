@@ -24,9 +24,10 @@ from a2tg_jax.texture import BYTES_PER_TEXEL, MAX_SIDE, Textures, check_textures
 Axes = Literal["paper", "authors"]
 """Rule for the axis that a thin Gaussian doubles."""
 PAPER_ITERATIONS = 30_000
-PAPER_INTERVAL, SHORT_INTERVAL = 1 / 60, 0.15
-"""Shares of a stage between two upscalings: the paper's 500 of 30,000 iterations, and a longer one for short stages, in
-which the statistic needs more time to settle."""
+PAPER_INTERVAL = 1 / 60
+"""Share of a stage between two upscalings: the paper's 500 of 30,000 iterations."""
+SHORT_INTERVAL = 0.15
+"""The same in shorter stages, in which the statistic needs more time to settle."""
 PAPER_THRESHOLD = 2e-5
 """k_G, in the unit of the authors' own statistic."""
 USUAL_SHARE = 0.25
@@ -128,12 +129,12 @@ class Upscale(HostEvent):
         return bytes_of(self.budget_mb)
 
     def most_bytes(self, num_bytes: float, num: int, num_iterations: int) -> float:
-        # Each time doubles both sides at most.
+        # An upscaling doubles both sides at most.
         texels = min(4.0 ** len(self.iterations(num_iterations)), self.cap**2)
         if self.select == "budget":
             return max(num_bytes, min(self._budget_bytes, num_bytes + BYTES_PER_TEXEL * num * texels))
-        # Most of those that grow have grown before, from one texel, or from none, which adds one more; how many will
-        # pass a threshold is unknown.
+        # Mostly the same textures grow each time, so one share of them reaches the largest size, from one texel. From
+        # none it is one texel more. How many pass a threshold is unknown.
         share = self.fraction if self.select == "fraction" else USUAL_SHARE
         return num_bytes + BYTES_PER_TEXEL * num * share * (texels - 1)
 
@@ -146,7 +147,7 @@ class Upscale(HostEvent):
         present = BYTES_PER_TEXEL * textures.count_elements(model.num)
         left = self._budget_bytes - num_bytes + present
         room = most_textures(textures.sizes, left, self.cap)
-        # Too many bytes of padding: steps are compiled again when textures grow.
+        # Padding would take too many bytes: steps are compiled again instead when textures grow.
         if BYTES_PER_TEXEL * room.num_elements > MOST_ROOM * self._budget_bytes:
             return model, moments
         rebuilt = reallocate(textures, textures.sizes, moments, room=room)
@@ -157,10 +158,14 @@ class Upscale(HostEvent):
             raise ValueError(
                 f"{in_words(model.appearance)} cannot grow textures: the stage needs Appearance(texture=Texture())"
             )
-        textures, num = model.textures, model.num
-        old_sizes, scales, averages = textures.sizes, np.asarray(model.gaussians.scales), np.asarray(state.average())
-        # Rows that do not exist yet count for nothing, and get nothing.
-        sizes, new_sizes = old_sizes[:num], old_sizes.copy()
+        textures = model.textures
+        num = model.num
+        old_sizes = textures.sizes
+        scales = np.asarray(model.gaussians.scales)
+        averages = np.asarray(state.average())
+        # Only rows that exist can grow.
+        sizes = old_sizes[:num]
+        new_sizes = old_sizes.copy()
 
         def propose(sizes: np.ndarray, anisotropic: bool) -> np.ndarray:
             return next_sizes(
@@ -176,7 +181,8 @@ class Upscale(HostEvent):
         grown = np.where(mask[:, None], proposed, sizes)
         unused = self._unused(sizes[mask], scales[:num][mask])
         if self.select == "budget" and due.index == due.count and (grown == proposed).all():
-            # All took what they proposed, and bytes are left: further upscalings, at last of both axes.
+            # The last event, and every proposal fits: the remaining bytes pay for further upscalings by the same rule,
+            # then of both axes.
             left = rule["budget_bytes"] - _bytes_between(sizes, grown)
             for anisotropic in (self.anisotropic, False):
                 mask = np.ones(1, bool)
@@ -194,14 +200,15 @@ class Upscale(HostEvent):
         return Change(model, rebuilt.moments, self.init(model), unused=unused)
 
     def _unused(self, sizes: np.ndarray, scales: np.ndarray) -> str | None:
-        """Return which choices about anisotropy that are not the defaults made no difference to textures that grow."""
+        """Return a sentence about options of anisotropy that differ from the defaults but made no difference to the
+        textures that grow; None if there are none."""
         names = [name for name in ("anisotropic", "k_a", "k_s") if getattr(self, name) != getattr(Upscale, name)]
         if not names:
             return None
-        # Not up to the own cap, where both rules may end at the same size.
-        thin = next_sizes(sizes, scales, k_a=self.k_a, k_s=self.k_s, cap=MAX_SIDE, axes=self.axes)
-        round_ = next_sizes(sizes, scales, k_a=self.k_a, k_s=self.k_s, cap=MAX_SIDE, anisotropic=False)
-        if (thin != round_).any():
+        # With the largest cap, because at `self.cap` both rules may give the same size.
+        by_rule = next_sizes(sizes, scales, k_a=self.k_a, k_s=self.k_s, cap=MAX_SIDE, axes=self.axes)
+        doubled = next_sizes(sizes, scales, k_a=self.k_a, k_s=self.k_s, cap=MAX_SIDE, anisotropic=False)
+        if (by_rule != doubled).any():
             return None
         return f"{' and '.join(names)} made no difference: no Gaussian whose texture grew was elongated and thin"
 
@@ -266,7 +273,8 @@ def next_sizes(
 def most_textures(sizes: np.ndarray, num_bytes: float, cap: int) -> Shape:
     """Return a shape with room for all textures that `next_sizes` can make of sizes [N, 2] within a number of bytes
     (host)."""
-    reached, num_before = np.unique(sizes, axis=0), 0
+    reached = np.unique(sizes, axis=0)
+    num_before = 0
     while len(reached) > num_before:
         num_before = len(reached)
         larger = [
@@ -324,7 +332,9 @@ def select(
       >>> a2tg.select(np.array([0.3, 0.1, 0.2]), sizes, proposed, budget_bytes=100)
       array([ True, False,  True])
     """
-    statistic, sizes, proposed = np.asarray(statistic), np.asarray(sizes), np.asarray(proposed)
+    statistic = np.asarray(statistic)
+    sizes = np.asarray(sizes)
+    proposed = np.asarray(proposed)
     check_shape("statistic", statistic, ("N",))
     check_shape("sizes", sizes, (len(statistic), 2))
     check_shape("proposed", proposed, (len(statistic), 2))
@@ -387,5 +397,5 @@ def reallocate(
 
 
 def _bytes_between(sizes: np.ndarray, larger: np.ndarray) -> int:
-    """Return the bytes that textures take more at their larger sizes."""
+    """Return the bytes that textures gain when they grow to larger sizes."""
     return BYTES_PER_TEXEL * int(np.prod(larger, axis=1).sum() - np.prod(sizes, axis=1).sum())

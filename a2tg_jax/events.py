@@ -137,11 +137,11 @@ class Change(NamedTuple):
     info: EventInfo = EventInfo()
     """Whether training can continue, and how many Gaussians found no room."""
     rows: np.ndarray | None = None
-    """[N] integers of an event on the host that moves rows: row i is the former row rows[i]; None: none has moved.
-    Model, moments and state are in the new order; statistics of other events follow."""
+    """[N] integers if an event on the host has moved rows, so that row i is the former row rows[i]; None: it has not.
+    Model, moments and state are in the new order; training moves the statistics of other events along."""
     unused: str | None = None
-    """Sentence that begins with a field of an event on the host and says that it made no difference this time, or None.
-    You are warned if it made none in the whole stage."""
+    """Sentence that a field of an event on the host, with whose name it begins, made no difference this time, or None.
+    You are warned if the field made none in the whole stage."""
 
 
 class Event(NamedFields):
@@ -175,8 +175,8 @@ class Event(NamedFields):
         """Return the state that `observe` starts from, a pytree of arrays; by default `GradientStatistics` if the event
         has a statistic, otherwise ().
 
-        It does not follow rows that another event moves inside the step: gather per row only in a stage in which none
-        does. `gather` follows rows that move on the host.
+        It is not moved when another event moves rows inside the step: keep numbers per row only in stages without such
+        events. When rows move on the host, `gather` moves it.
         """
         if self.statistic is None:
             return ()
@@ -277,8 +277,8 @@ def iterations_at(fractions: tuple[float, ...], num_iterations: int, *, with_end
     """
     is_inside = all(0 < fraction < 1 or (with_end and fraction == 1) for fraction in fractions)
     if not is_inside or list(fractions) != sorted(set(fractions)):
-        wanted = "fractions above 0, up to 1" if with_end else "fractions between 0 and 1"
-        raise ValueError(f"at must be ascending {wanted}; got {shortened(fractions)}")
+        limits = "above 0, up to 1" if with_end else "between 0 and 1"
+        raise ValueError(f"at must be ascending fractions {limits}; got {shortened(fractions)}")
     # Iterations count from 1: at 0 the event would never happen.
     return tuple(dict.fromkeys(max(1, round(fraction * num_iterations)) for fraction in fractions))
 
@@ -302,17 +302,19 @@ def keep_rows(model: Model, moments: AdamState, state: object, is_kept: Array | 
       ValueError: if it is no such mask or keeps fewer than 2, or if textures or view dependence have blocks of several
         sizes.
     """
-    num, rows = model.num, np.arange(model.gaussians.num, dtype=np.int32)
+    num = model.num
+    rows = np.arange(model.gaussians.num, dtype=np.int32)
     is_kept = np.asarray(is_kept)
     check_mask("is_kept", is_kept, (len(rows) if is_kept.shape == rows.shape else num,))
     is_kept = is_kept[:num]
-    if (num_kept := int(is_kept.sum())) < LEAST_LEFT:
+    num_kept = int(is_kept.sum())
+    if num_kept < LEAST_LEFT:
         raise ValueError(f"is_kept must keep at least {LEAST_LEFT} Gaussians; got {num_kept} of {num:,}")
-    # What is removed stays behind the others, where `num_live` leaves it out, so that no shape changes.
+    # Removed rows move to the end, where `num_live` excludes them, so that no shape changes.
     rows[:num] = np.concatenate([np.flatnonzero(is_kept), np.flatnonzero(~is_kept)])
     moments = gather_moments(moments, rows)
-    left = jax.device_put(np.asarray(num_kept, np.int32))
-    model = dataclasses.replace(gather_rows(model, rows), num_live=left)
+    num_live = jax.device_put(np.asarray(num_kept, np.int32))
+    model = dataclasses.replace(gather_rows(model, rows), num_live=num_live)
     return Change(model, moments, state, rows=rows)
 
 
@@ -348,19 +350,21 @@ def clear_moments(model: Model, moments: AdamState, is_cleared: Array) -> AdamSt
 # of the projected mean to choose what is cloned or split.
 
 
-def read_probe(found: Array, statistic: str, width: int, height: int) -> tuple[Array, Array]:
+def read_probe(at_probe: Array, statistic: str, width: int, height: int) -> tuple[Array, Array]:
     """Return the statistic of each Gaussian [..., N, 3], on the screen in units of half an image, and whether it was
     composited at one or more pixels [..., N].
 
-    The gradients [..., N, 4] of one view or several are those at a probe (`view_gradients`). The statistic is of
-    the "position" in the world, or another one on the screen.
+    Args:
+      at_probe: [..., N, 4] gradients at the probe of one view or several (`compositor.composite`).
+      statistic: "position", in the world, or another one, on the screen.
+      width, height: size of the views in pixels.
     """
-    gradients = found[..., :3]
+    gradients = at_probe[..., :3]
     if statistic != "position":
         # Chain rule: ∂L/∂(x / (W/2)) = W/2·∂L/∂x.
-        half = jnp.asarray([width / 2, height / 2, 1.0], found.dtype)
-        gradients = gradients * half.reshape((1,) * (found.ndim - 1) + (3,))
-    return gradients, found[..., 3] > 0
+        half = jnp.asarray([width / 2, height / 2, 1.0], at_probe.dtype)
+        gradients = gradients * half.reshape((1,) * (at_probe.ndim - 1) + (3,))
+    return gradients, at_probe[..., 3] > 0
 
 
 @pytree

@@ -159,16 +159,16 @@ def plan_growth(
     least: Array | int = 0,
     draw: DrawHosts | None = None,
 ) -> Moves:
-    """Plan what `grow` does to rows of these opacities [N], of which the first `num_live` exist, to at least `least`
-    where the cap allows it. Hosts are drawn as in `plan_relocation`."""
+    """Plan what `grow` does to rows of these opacities [N], of which the first `num_live` exist. It grows to at least
+    `least`, within the cap. Hosts are drawn as in `plan_relocation`."""
     index = jnp.arange(opacities.shape[0], dtype=jnp.int32)
     is_live = index < num_live
     is_host = is_live & (opacities > DEAD_OPACITY)
     has_hosts = jnp.any(is_host)
     # n + ⌊n/20⌋ is ⌊1.05·n⌋ in integers, free of rounding.
-    wanted = jnp.maximum(jnp.maximum(num_live + 1, num_live + num_live // 20), jnp.asarray(least, jnp.int32))
-    wanted = jnp.minimum(jnp.asarray(cap, jnp.int32), wanted)
-    grown = jnp.where(has_hosts, jnp.maximum(wanted, num_live), num_live)
+    grown = jnp.maximum(jnp.maximum(num_live + 1, num_live + num_live // 20), jnp.asarray(least, jnp.int32))
+    grown = jnp.minimum(jnp.asarray(cap, jnp.int32), grown)
+    grown = jnp.where(has_hosts, jnp.maximum(grown, num_live), num_live)
     is_added = ~is_live & (index < grown)
     hosts = draw_hosts(key, opacities, is_host) if draw is None else draw(key, is_host, is_added)
     rows, num_draws = _copied_rows(hosts, is_added)
@@ -209,7 +209,8 @@ def perturb(
     check_shape("lr", lr, ())
     scales = gaussians.scales if scales is None else scales
     check_shape("scales", scales, (gaussians.num, 3 if np.shape(scales)[1:] == (3,) else 2))
-    means, dtype = gaussians.means, gaussians.means.dtype
+    means = gaussians.means
+    dtype = gaussians.means.dtype
     noise = jax.random.normal(key, means.shape, dtype)
     axes = rotation_matrices(gaussians.quats)[:, :, : scales.shape[1]]
     # Sums of products instead of matmuls, which accelerators may round to fewer bits.
@@ -246,7 +247,9 @@ def draw_hosts(key: Array, opacities: Array, is_host: Array) -> Array:
     # Rounding may lead past the last block that has hosts.
     block = jnp.minimum(block, jnp.maximum(num_hosts - 1, 0) // width).astype(jnp.int32)
     # By bisection, the first column above the target in the block's ascending row.
-    target, column, step = u_within * within[block, -1], jnp.zeros_like(block), width // 2
+    target = u_within * within[block, -1]
+    column = jnp.zeros_like(block)
+    step = width // 2
     while step:
         column = jnp.where(within[block, column + (step - 1)] <= target, column + step, column)
         step //= 2
@@ -264,7 +267,7 @@ def _moved(gaussians: Gaussians, moments: Any, num_live: Array, moves: Moves) ->
     """Copy rows from their hosts after sharing, and clear their moments."""
     logits, scales = share(gaussians.logit_opacities, gaussians.log_scales, moves.num_shares)
     copied = dataclasses.replace(gaussians, logit_opacities=logits, log_scales=scales)[moves.rows]
-    # Of the leaves, only the number of Adam's updates has no rows.
+    # The only leaf without rows is the number of Adam's updates.
     moments = jax.tree.map(
         lambda x: jnp.where(moves.is_reset.reshape(-1, *[1] * (x.ndim - 1)), jnp.zeros_like(x), x) if x.ndim else x,
         moments,
@@ -356,7 +359,8 @@ class Mcmc(StepEvent):
     def apply(self, now: Now, model: Model, moments: AdamState, state: Any) -> Change:
         # Dead Gaussians move first: their new places can be hosts of what is added.
         moved, moments, _ = self._move(model, moments, functools.partial(plan_relocation, now.keys[0]))
-        least, cap = self.least(now, model.live_count), min(self.cap, model.gaussians.num)
+        least = self.least(now, model.live_count)
+        cap = min(self.cap, model.gaussians.num)
         plan = functools.partial(plan_growth, now.keys[1], cap=cap, least=least)
         model, moments, info = self._move(moved, moments, plan)
         return Change(model, moments, state, EventInfo(is_possible=info.has_hosts))
@@ -378,7 +382,7 @@ class Mcmc(StepEvent):
 
 @pytree
 class FillingMcmc(Mcmc):
-    """Variant of `Mcmc` that grows by more than 5 % if it takes that to reach the cap by its last event."""
+    """Variant of `Mcmc` that grows by more than 5 % where that is needed to reach the cap by its last event."""
 
     def check_options(self) -> None:
         check_number("cap", self.cap, least=2)

@@ -112,8 +112,8 @@ class Model(NamedFields):
     @property
     def num_published_bytes(self) -> int:
         """Bytes as the method's authors count them (host)."""
-        own = self.gaussians.floats_per_row * self.num
-        return BYTES_PER_FLOAT * (own + self.appearance.num_published_floats(self.num))
+        num_floats = self.gaussians.floats_per_row * self.num + self.appearance.num_published_floats(self.num)
+        return BYTES_PER_FLOAT * num_floats
 
     def bytes_of(self, num: int) -> int:
         """Return the bytes of the trained floats of the first `num` Gaussians and their appearance (host)."""
@@ -123,7 +123,7 @@ class Model(NamedFields):
     @property
     def num_padding_bytes(self) -> int:
         """Bytes of padding in the buffers (host)."""
-        # Of tables without the places of the blocks, which are not counted.
+        # Places of blocks in tables are not counted.
         arrays = map_rows(lambda array: array, lambda table: table.buckets, self.appearance)
         allocated = sum(leaf.nbytes for leaf in jax.tree.leaves(arrays))
         filled = count_floats(self.appearance, self.num) + self.appearance.replaced_floats * self.num
@@ -158,7 +158,8 @@ class Model(NamedFields):
     @property
     def degrees(self) -> np.ndarray:
         """[N] degrees of the spherical harmonics of each allocated Gaussian (host)."""
-        base, coefficients = self.gaussians.sh_degree, self.appearance.coefficients
+        base = self.gaussians.sh_degree
+        coefficients = self.appearance.coefficients
         if coefficients is None:
             return np.full(self.gaussians.num, base)
         return degrees_of_sizes(coefficients.sizes, base)
@@ -167,20 +168,21 @@ class Model(NamedFields):
     def sh(self) -> np.ndarray:
         """[N, K, 3] all spherical harmonics, with zeros above the degree of a Gaussian; K belongs to the highest degree
         (host)."""
-        own, coefficients = np.asarray(self.gaussians.sh), self.appearance.coefficients
+        common = np.asarray(self.gaussians.sh)
+        coefficients = self.appearance.coefficients
         if coefficients is None:
-            return own
+            return common
         highest = int(self.degrees.max(initial=self.gaussians.sh_degree))
         dense = dense_bands(coefficients, self.gaussians.sh_degree)
-        return np.concatenate([own, dense], axis=1, dtype=own.dtype)[:, : NUM_BASES[highest]]
+        return np.concatenate([common, dense], axis=1, dtype=common.dtype)[:, : NUM_BASES[highest]]
 
     def with_sh(self, sh: np.ndarray) -> "Model":
         """Return the same model with other spherical harmonics, as `sh` gives them; degrees stay (host). ValueError:
         they have another shape."""
         base = self.gaussians.sh_degree
         check_shape("sh", sh, (self.gaussians.num, "K", 3))
-        own = jnp.asarray(sh[:, : NUM_BASES[base]], self.gaussians.sh.dtype)
-        model = dataclasses.replace(self, gaussians=dataclasses.replace(self.gaussians, sh=own))
+        common = jnp.asarray(sh[:, : NUM_BASES[base]], self.gaussians.sh.dtype)
+        model = dataclasses.replace(self, gaussians=dataclasses.replace(self.gaussians, sh=common))
         if self.appearance.coefficients is None:
             return model
         coefficients = bands_of_dense(sh[:, NUM_BASES[base] :], self.degrees, base)
@@ -304,16 +306,19 @@ def concatenate(models: Sequence[Model]) -> Model:
         check_kind(f"models[{index}]", model, Model)
         check_appearance(model.appearance, model.gaussians)
     models = [model.live for model in models]
-    first, words = models[0], [in_words(model.appearance) for model in models]
-    for model, shown in zip(models, words, strict=True):
-        options, others = first.appearance.texture_options, model.appearance.texture_options
+    first = models[0]
+    for model in models:
+        options = first.appearance.texture_options
+        others = model.appearance.texture_options
         if options is not None and others is not None and options.extent != others.extent:
             raise ValueError(
                 f"models must have textures of one extent; got {options.extent:g} and {others.extent:g}: train them "
                 "with the same lookup.extent, or bake them first (a2tg convert --bake)"
             )
         if template_of(model.appearance) != template_of(first.appearance):
-            why = f"{words[0]} and {shown}" if shown != words[0] else f"{shown} of different options"
+            expected = in_words(first.appearance)
+            got = in_words(model.appearance)
+            why = f"{expected} and {got}" if got != expected else f"{got} of different options"
             raise ValueError(f"models must have one appearance; got {why}")
         if model.gaussians.means.dtype != first.gaussians.means.dtype:
             dtypes = f"{first.gaussians.means.dtype} and {model.gaussians.means.dtype}"
@@ -328,9 +333,12 @@ def concatenate(models: Sequence[Model]) -> Model:
     highest = max(model.gaussians.sh.shape[1] for model in models)
     several = [model.gaussians for model in models]
     if first.appearance.bands is None:
-        pads = [((0, 0), (0, highest - own.sh.shape[1]), (0, 0)) for own in several]
-        several = [dataclasses.replace(own, sh=jnp.pad(own.sh, pad)) for own, pad in zip(several, pads, strict=True)]
+        for index, gaussians in enumerate(several):
+            missing = highest - gaussians.sh.shape[1]
+            sh = jnp.pad(gaussians.sh, ((0, 0), (0, missing), (0, 0)))
+            several[index] = dataclasses.replace(gaussians, sh=sh)
     if len({gaussians.sh_degree for gaussians in several}) > 1:
         raise ValueError(f"models must have one degree below their bands; got {[g.sh_degree for g in several]}")
-    gaussians, appearance = join_rows([(own, model.appearance) for own, model in zip(several, models, strict=True)])
+    appearances = [model.appearance for model in models]
+    gaussians, appearance = join_rows([*zip(several, appearances, strict=True)])
     return dataclasses.replace(first, gaussians=gaussians, appearance=appearance)

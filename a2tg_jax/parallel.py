@@ -57,8 +57,8 @@ def in_views(mesh: Mesh | None, function: Callable[[Any, Any], T]) -> Callable[[
     so that each device calls it with its own views."""
     if mesh is None:
         return function
-    # Not left to XLA, which cannot divide the call of a kernel. The loops of XLA do not say which devices their carries
-    # differ on.
+    # Not left to XLA, which cannot divide the call of a kernel. check_vma=False, because the loops of `xla` do not
+    # declare which devices their carries differ on.
     return jax.shard_map(function, mesh=mesh, in_specs=(P(), P(AXIS)), out_specs=P(AXIS), check_vma=False)
 
 
@@ -126,8 +126,8 @@ def _of_first_process(mesh: Mesh, tree: T) -> T:
     digests = multihost_utils.process_allgather(np.asarray(zlib.crc32(shapes.encode()), np.uint32))
     if len(np.unique(digests)) > 1:
         raise ValueError("the processes differ after a change of the model: train on machines that are alike")
-    found: T = multihost_utils.broadcast_one_to_all(tree)
-    return found
+    of_first: T = multihost_utils.broadcast_one_to_all(tree)
+    return of_first
 
 
 def everywhere(mesh: Mesh | None, tree: T) -> T:

@@ -112,7 +112,8 @@ def render_appearance(
     background = background_array(background, gaussians, num_colors)
     if num_live is not None:
         check_shape("num_live", num_live, ())
-        is_known, num = not isinstance(num_live, jax.core.Tracer), gaussians.num
+        is_known = not isinstance(num_live, jax.core.Tracer)
+        num = gaussians.num
         if not jnp.issubdtype(dtype_of(num_live), jnp.integer) or (is_known and not 0 <= int(num_live) <= num):
             raise ValueError(f"num_live must be an integer, 0 to {num}; got {num_live}")
     planned = with_capacity(settings, gaussians, camera, appearance, num_live)
@@ -143,7 +144,7 @@ class _Watched(NamedTuple):
 def _watch(rendered: _Watched, kind: Hashable) -> None:
     """Warn if this eager render, or one before it that is done by now, has overflowed or is empty.
 
-    The first render of a kind (settings, image size and number of Gaussians) is waited for; later ones are read once
+    It waits for the first render of a kind (settings, image size and number of Gaussians). Later ones are read once
     they are done, so that rendering stays asynchronous.
     """
     with _watch_lock:
@@ -156,7 +157,7 @@ def _watch(rendered: _Watched, kind: Hashable) -> None:
             if not _pending or not (_pending[0].num_pairs.is_deleted() or _pending[0].num_pairs.is_ready()):
                 return
             done = _pending.popleft()
-        # What is deleted has no value to read.
+        # Deleted arrays have no values.
         if done.num_pairs.is_deleted() or done.overflow.is_deleted():
             continue
         # Explicit transfers, which `jax.transfer_guard` lets pass.
@@ -185,8 +186,8 @@ def with_features(appearance: Appearance, features: ArrayLike | None, gaussians:
     features = plain_array("features", features, gaussians.means.dtype)
     check_floats("features", features, (gaussians.num, "D"))
     if dtype_of(features) != gaussians.means.dtype or not np.shape(features)[1]:
-        found = f"{dtype_of(features)}{[*np.shape(features)]}"
-        raise ValueError(f"features must be {gaussians.means.dtype} as the means are, D >= 1; got {found}")
+        got = f"{dtype_of(features)}{[*np.shape(features)]}"
+        raise ValueError(f"features must be {gaussians.means.dtype} as the means are, D >= 1; got {got}")
     return dataclasses.replace(appearance, features=jnp.asarray(features))
 
 

@@ -20,7 +20,7 @@ from a2tg_jax.render import appearance_of, background_array, jitted_render
 from a2tg_jax.texture import Textures
 
 FIRST_ROOM = 1.5
-"""Head room over the first views."""
+"""Head room of the first capacity."""
 GROWTH = 3
 """Least factor by which a capacity grows."""
 PLANNED_CAMERAS = 16
@@ -71,8 +71,10 @@ def plan_render(
     if isinstance(gaussians, Model):
         if appearance is not None or textures is not None:
             raise ValueError("a model has an appearance already: use plan_render(model, cameras)")
-        model, gaussians = gaussians, gaussians.gaussians
-        appearance, num_live = model.appearance, model.num_live
+        model = gaussians
+        gaussians = gaussians.gaussians
+        appearance = model.appearance
+        num_live = model.num_live
     check_gaussians(gaussians)
     if appearance is None:
         appearance = appearance_of(gaussians, textures, settings)
@@ -88,7 +90,7 @@ def plan_render(
 def room_for(model: Model, cameras: Sequence[Camera]) -> RenderSettings:
     """Return settings with room for a model's tile lists in each view (host)."""
     settings = plan_render(model, cameras)
-    # Programs are compiled for a room: for few of them.
+    # A power of two, so that programs are compiled for few capacities.
     return dataclasses.replace(settings, capacity=1 << (settings.capacity or 1).bit_length())
 
 
@@ -143,12 +145,14 @@ class Renderer:
         check_gaussians(model.gaussians)
         check_is_appearance(model.appearance, model.gaussians)
         background = model.default_background if background is None else background
-        self._gaussians, self._num_live = model.gaussians, model.num_live
+        self._gaussians = model.gaussians
+        self._num_live = model.num_live
         self._appearance = model.appearance
         self._background = background_array(background, model.gaussians, num_colors_of(model.appearance))
-        self._settings, self._has_geometry = settings, has_geometry
-        own = [] if model.origin is None else model.origin.cameras
-        self._known = evenly_chosen(own, PLANNED_CAMERAS)
+        self._settings = settings
+        self._has_geometry = has_geometry
+        cameras_of_model = [] if model.origin is None else model.origin.cameras
+        self._planned = evenly_chosen(cameras_of_model, PLANNED_CAMERAS)
         self.capacities: dict[Size, int] = dict(capacities or {})
         """Capacities for (splat, tile) pairs by image size, (width, height)."""
         for camera in checked_cameras(cameras):
@@ -164,8 +168,8 @@ class Renderer:
         check_camera(camera)
         size = camera.width, camera.height
         if size not in self.capacities:
-            cameras = [camera, *(resize_camera(known, *size) for known in self._known)]
-            # A first view may see next to nothing; if all Gaussians are visible, each is in at least one tile.
+            cameras = [camera, *(resize_camera(planned, *size) for planned in self._planned)]
+            # A first view may see next to nothing: in another one all Gaussians may be visible, in a tile or more each.
             pairs = max(self._gaussians.num, *map(self._num_pairs, cameras))
             self.capacities[size] = capacity_for(pairs, FIRST_ROOM)
         output, needed = self._draw(camera)

@@ -41,7 +41,9 @@ class Textures(Table):
 
         Texel j of a side that grows from T to T' comes from ⌊(j + 1/2)·T/T'⌋, in integers.
         """
-        v, u = ((2 * np.arange(new) + 1) * old // (2 * new) for old, new in zip(blocks.shape[1:3], size, strict=True))
+        height, width = size
+        v = (2 * np.arange(height) + 1) * blocks.shape[1] // (2 * height)
+        u = (2 * np.arange(width) + 1) * blocks.shape[2] // (2 * width)
         return blocks[:, v[:, None], u[None, :]]
 
     @property
@@ -68,8 +70,8 @@ def checked_sizes(sizes: ArrayLike, name: str = "sizes") -> np.ndarray:
         raise ValueError(f"{name} must be integers [N, 2] as (Tv, Tu); got {sizes.dtype} {sizes.shape}")
     is_wrong = ((sizes < 1) | (sizes > MAX_SIDE)).any(axis=1) & (sizes != 0).any(axis=1)
     if is_wrong.any():
-        found = sizes[is_wrong]
-        raise ValueError(f"texture sides must be in 1..{MAX_SIDE}, or both 0; got {found.min()}..{found.max()}")
+        wrong = sizes[is_wrong]
+        raise ValueError(f"texture sides must be in 1..{MAX_SIDE}, or both 0; got {wrong.min()}..{wrong.max()}")
     return sizes
 
 
@@ -116,16 +118,16 @@ def textures_from_arrays(arrays: Sequence[ArrayLike]) -> Textures:
       >>> [array.shape for array in a2tg.texture_arrays(textures)]
       [(2, 3, 4), (1, 1, 4)]
     """
-    given = [np.asarray(plain_array(f"texture {index}", array)) for index, array in enumerate(arrays)]
-    for index, array in enumerate(given):
+    textures = [np.asarray(plain_array(f"texture {index}", array)) for index, array in enumerate(arrays)]
+    for index, array in enumerate(textures):
         if array.ndim != 3 or array.shape[2] != 4:
             raise ValueError(f"texture {index} must be [Tv, Tu, 4]; got {array.shape}")
         if not jnp.issubdtype(array.dtype, jnp.floating):
             raise ValueError(f"texture {index} must be floats; got {array.dtype}")
-    sizes = checked_sizes(np.array([array.shape[:2] for array in given], np.int64).reshape(-1, 2))
-    # Keeps the dtype, and the number of channels, without any texture.
-    empty = np.zeros((0, 4), given[0].dtype if given else np.float32)
-    return Textures.of_flat(sizes, np.concatenate([empty, *(array.reshape(-1, 4) for array in given)]))
+    sizes = checked_sizes(np.array([array.shape[:2] for array in textures], np.int64).reshape(-1, 2))
+    # Gives the result its dtype and number of channels if there are no textures.
+    empty = np.zeros((0, 4), textures[0].dtype if textures else np.float32)
+    return Textures.of_flat(sizes, np.concatenate([empty, *(array.reshape(-1, 4) for array in textures)]))
 
 
 def texture_arrays(textures: Textures) -> list[np.ndarray]:

@@ -175,12 +175,15 @@ class Appearance(NamedFields):
         """
         if not isinstance(rate, Mapping):
             return rate
-        own = {name: value for name in array_fields(self) if (value := getattr(self, name)) is not None}
-        if unknown := [*rate.keys() - own.keys()]:
-            raise ValueError(f"rates must be by the fields {', '.join(own)}; got {unknown[0]!r}")
-        rates = {name: rate.get(name, 0.0) for name in own} | {
-            name: value.rates(rate.get(name, 0.0)) for name, value in own.items() if isinstance(value, Part)
-        }
+        names = [name for name in array_fields(self) if getattr(self, name) is not None]
+        unknown = [*rate.keys() - names]
+        if unknown:
+            raise ValueError(f"rates must be by the fields {', '.join(names)}; got {unknown[0]!r}")
+        rates = {}
+        for name in names:
+            part = getattr(self, name)
+            own_rate = rate.get(name, 0.0)
+            rates[name] = part.rates(own_rate) if isinstance(part, Part) else own_rate
         return dataclasses.replace(self, **rates)
 
     def opacities(self, gaussians: Gaussians) -> Array:
@@ -295,7 +298,8 @@ def appearance_for(
 def in_words(appearance: Appearance) -> str:
     """Return an appearance in words, such as "Rings with texture and bands"; "plain Gaussians" without anything."""
     kind = "Gaussians" if type(appearance) is Appearance else type(appearance).__name__
-    if not (parts := [*_parts_of(appearance)]):
+    parts = [*_parts_of(appearance)]
+    if not parts:
         return "plain Gaussians" if kind == "Gaussians" else kind
     *first, last = parts
     return f"{kind} with {', '.join(first)} and {last}" if first else f"{kind} with {last}"
@@ -326,30 +330,32 @@ def gaussian_cutoff(peak: Array) -> Array:
 
 def color_sums(appearance: Appearance, gaussians: Gaussians, camera: Camera, degree: Integer) -> Array:
     """Return the sums of spherical harmonics [N, 3], from which 0.5 leads to colours; linear in the coefficients."""
-    own = sh_sum(gaussians.sh, gaussians.means, camera.center, degree)
+    sums = sh_sum(gaussians.sh, gaussians.means, camera.center, degree)
     bands = appearance.bands
-    return own if bands is None else own + bands.color_sums(gaussians, camera.center, degree)
+    return sums if bands is None else sums + bands.color_sums(gaussians, camera.center, degree)
 
 
 def colors_in_view(appearance: Appearance, gaussians: Gaussians, camera: Camera, degree: Integer) -> Array:
     """Return the colours [N, D], or the features, of the splats in a view."""
-    for given in (appearance.features, appearance.given_colors):
-        if given is not None:
-            return given
+    if appearance.features is not None:
+        return appearance.features
+    if appearance.given_colors is not None:
+        return appearance.given_colors
     return appearance.own_colors(gaussians, camera, degree)
 
 
 def numbers_in_view(appearance: Appearance, gaussians: Gaussians, camera: Camera, degree: Integer) -> Array:
     """Return the numbers [N, K] of the splats in a view, followed by the curves of kernels with exponents."""
-    own = appearance.numbers_at(gaussians, camera, degree)
+    numbers = appearance.numbers_at(gaussians, camera, degree)
     shapes = appearance.shapes
-    return own if shapes is None else jnp.concatenate([own, jnp.stack(curves_of(shapes), axis=1)], axis=1)
+    return numbers if shapes is None else jnp.concatenate([numbers, jnp.stack(curves_of(shapes), axis=1)], axis=1)
 
 
 def cutoff_of(appearance: Appearance, opacities: Array) -> Array:
     """Return the squared distance [N] beyond which alpha is below 1/255, of kernels with their exponents."""
-    bound, shapes = appearance.cutoff(opacities).astype(opacities.dtype), appearance.shapes
-    # The bound of a Gaussian says at which exponent of the falloff alpha is below 1/255.
+    bound = appearance.cutoff(opacities).astype(opacities.dtype)
+    shapes = appearance.shapes
+    # The bound is for a Gaussian's falloff; kernels reach the same falloff elsewhere.
     return bound if shapes is None else reach_of(curves_of(shapes), bound)
 
 
@@ -368,7 +374,8 @@ def without_arrays(node: Any, instead: Callable[[str], Any], name: str = "") -> 
     field that is not None."""
     changes = {}
     for field in array_fields(node):
-        value, path = getattr(node, field), f"{name}.{field}" if name else field
+        value = getattr(node, field)
+        path = f"{name}.{field}" if name else field
         if isinstance(value, Part):
             changes[field] = without_arrays(value, instead, path)
         elif value is not None:
@@ -382,7 +389,8 @@ def template_of(appearance: A) -> A:
 
 
 def _parts_of(appearance: Appearance) -> dict[str, Part]:
-    return {name: part for name in PARTS if (part := getattr(appearance, name)) is not None}
+    parts = {name: getattr(appearance, name) for name in PARTS}
+    return {name: part for name, part in parts.items() if part is not None}
 
 
 def allocate_appearance(template: A, key: Array, gaussians: Gaussians) -> A:
@@ -425,8 +433,8 @@ def project_appearance(appearance: A) -> A:
 
 
 def count_floats(appearance: Appearance, num: int) -> int:
-    """Return the trained floats of the first `num` Gaussians besides their own, without padding (host). An opacity that
-    is not trained counts as -1, what Gaussians share once, for 0 Gaussians as well."""
+    """Return the trained floats of the appearance of the first `num` Gaussians, without padding (host). An opacity that
+    is not trained counts as −1. Arrays that Gaussians share count once, even for 0 Gaussians."""
     total = -appearance.replaced_floats * num
     for leaf in jax.tree.leaves(appearance, is_leaf=is_whole):
         if is_shared(leaf):
@@ -440,7 +448,8 @@ def count_floats(appearance: Appearance, num: int) -> int:
 
 def check_appearance(appearance: Appearance, gaussians: Gaussians) -> None:
     """Raise ValueError, naming the field, unless the arrays of an appearance exist and fit the Gaussians (host)."""
-    kind, dtypes = type(appearance).__name__, " or ".join(FLOATS)
+    kind = type(appearance).__name__
+    dtypes = " or ".join(FLOATS)
     check_arrays_given(appearance)
     for path, leaf in jax.tree_util.tree_leaves_with_path(partition(appearance)[0]):
         if str(leaf.dtype) not in FLOATS:
@@ -464,8 +473,8 @@ def check_appearance(appearance: Appearance, gaussians: Gaussians) -> None:
 
 def check_arrays_given(appearance: Appearance) -> None:
     """Raise ValueError if a subclass or a part is a template without its arrays."""
-    own = own_fields(appearance)
-    missing = own[:1] if all(getattr(appearance, name) is None for name in own) else []
+    added = own_fields(appearance)
+    missing = added[:1] if all(getattr(appearance, name) is None for name in added) else []
     for name, part in _parts_of(appearance).items():
         missing += [f"{name}.{field}" for field in array_fields(part) if getattr(part, field) is None]
     if missing:
@@ -475,8 +484,7 @@ def check_arrays_given(appearance: Appearance) -> None:
         )
 
 
-# Rows, of Gaussians and appearances alike: every array has a row for each Gaussian, every table a block; what is shared
-# has neither
+# Rows of Gaussians and appearances: an array has a row for each Gaussian, a table a block; what is shared has neither
 
 
 def clear_rows(tree: T, is_cleared: Array) -> T:
@@ -503,8 +511,8 @@ def join_rows(trees: Sequence[T]) -> T:
     def check_shared(path: Any, first: object, *others: object) -> None:
         arrays = jax.tree.leaves(first) if is_shared(first) else []
         for other in others if arrays else ():
-            found = jax.tree.leaves(other)
-            if len(found) != len(arrays) or not all(map(np.array_equal, arrays, found)):
+            other_arrays = jax.tree.leaves(other)
+            if len(other_arrays) != len(arrays) or not all(map(np.array_equal, arrays, other_arrays)):
                 name = jax.tree_util.keystr(path).rpartition("].")[-1]
                 raise ValueError(f"{name} must be equal in all models, because all Gaussians share it")
 

@@ -27,8 +27,10 @@ from a2tg_jax.core.numerics import safe_divide
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.texture import MAX_SIDE, Textures, allocate_textures
 
-INITIAL_PEAK, INITIAL_SIGMA = 0.5, 0.3
-"""Peak and σ, in units of u, of the initial alpha picture; it falls to an invisible 0.002 at the border."""
+INITIAL_PEAK = 0.5
+"""Peak of the initial alpha picture."""
+INITIAL_SIGMA = 0.3
+"""Its σ, in units of u; at the border it has fallen to an invisible 0.002."""
 LEAST_PEAK = 0.999 / 255  # rounding must not hide a picture that reaches 1/255
 
 
@@ -56,11 +58,12 @@ class Billboards(Appearance):
 
     def atlas(self) -> tuple[Array, TextureRegion]:
         """Return the texels [T, 4], RGB in (0, 1) and alpha, and the places of the pictures."""
-        (bucket,), row = self._bucket(), self._rows()
-        shown = jnp.concatenate([jax.nn.sigmoid(bucket[..., :3]), bucket[..., 3:]], axis=-1)
+        (bucket,) = self._bucket()
+        row = self._rows()
+        texels = jnp.concatenate([jax.nn.sigmoid(bucket[..., :3]), bucket[..., 3:]], axis=-1)
         first = row * jnp.int32(self.side**2)
         side = jnp.full_like(first, self.side)
-        return shown.reshape(-1, 4), TextureRegion(first, side, side)
+        return texels.reshape(-1, 4), TextureRegion(first, side, side)
 
     def peak_opacities(self, gaussians: Gaussians) -> Array:
         # The picture's alpha is the whole opacity.
@@ -93,8 +96,8 @@ class Billboards(Appearance):
         return (u + 1) * ((self.side - 1) / 2)
 
     def _inside(self, u: Array) -> Array:
-        """Return the factor that makes a clamped lookup one among zeros: 1 up to the outer texels, 0 from one texel
-        beyond."""
+        """Return the factor that fades a clamped lookup out, as if zeros surrounded the picture: 1 up to the outer
+        texels, 0 from one texel beyond them."""
         x = self._place(u)
         return jnp.clip(1 - jnp.maximum(-x, x - (self.side - 1.0)), 0.0, 1.0)
 
@@ -118,8 +121,8 @@ class Billboards(Appearance):
             return rate
         rgb, alpha = rate
         assert self.pictures is not None
-        of_texels = jnp.full((1, 1, 1, 4), rgb).at[..., 3].set(alpha)
-        return dataclasses.replace(self, pictures=dataclasses.replace(self.pictures, buckets=(of_texels,)))
+        rates = jnp.full((1, 1, 1, 4), rgb).at[..., 3].set(alpha)
+        return dataclasses.replace(self, pictures=dataclasses.replace(self.pictures, buckets=(rates,)))
 
     def opacities(self, gaussians: Gaussians) -> Array:
         """Return the mean alpha [N] of the texels."""
@@ -152,9 +155,9 @@ class Billboards(Appearance):
 
     def _bucket(self) -> tuple[Array]:
         """Return the one bucket of pictures. Raise ValueError if there are several sizes."""
-        found = None if self.pictures is None else self.pictures.bucket_sizes
-        if self.pictures is None or found != ((self.side, self.side),):
-            raise ValueError(f"pictures must all have {self.side} × {self.side} texels; got sizes {found}")
+        sizes = None if self.pictures is None else self.pictures.bucket_sizes
+        if self.pictures is None or sizes != ((self.side, self.side),):
+            raise ValueError(f"pictures must all have {self.side} × {self.side} texels; got sizes {sizes}")
         return self.pictures.buckets  # type: ignore[return-value]
 
     def _rows(self) -> Array:

@@ -24,7 +24,7 @@ from a2tg_jax.core.table import check_table, is_table
 from a2tg_jax.texture import NEUTRAL_TEXEL
 
 ODD_SHAPE = (5, 7)
-"""Shape of arrays that fits no matrix in an appearance by chance."""
+"""Odd shape of test arrays, which no matrix in an appearance fits by chance."""
 CURVE = len(Curve._fields)
 
 
@@ -72,12 +72,13 @@ class StaticShading:
     @property
     def functions(self) -> Elementwise:
         """The functions, composed with exponents and features."""
-        own = self.appearance
-        has_curve, has_features = own.exponents is not None, own.features is not None
+        appearance = self.appearance
+        has_curve = appearance.exponents is not None
+        has_features = appearance.features is not None
 
         def shade(numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array) -> Any:
             # The curve is last (`numbers_in_view`).
-            shaded: Any = own.shade(numbers[:-CURVE] if has_curve else numbers, values, u, v)
+            shaded: Any = appearance.shade(numbers[:-CURVE] if has_curve else numbers, values, u, v)
             if not isinstance(shaded, tuple | list) or len(shaded) not in (2, 3):
                 return shaded  # `check_shading` names a result of another form.
             residual, factor, tint = (*shaded, None)[:3]
@@ -85,10 +86,16 @@ class StaticShading:
             return (None, factor, None) if has_features else (residual, factor, tint)
 
         def falloff(numbers: tuple[Array, ...], rho: Array) -> Array:
-            return falloff_of(Curve(*numbers[-CURVE:]), rho) if has_curve else own.falloff(numbers, rho)
+            return falloff_of(Curve(*numbers[-CURVE:]), rho) if has_curve else appearance.falloff(numbers, rho)
 
-        empty = own.empty if own.texture is None else NEUTRAL_TEXEL
-        return Elementwise(own.texel_position, shade, falloff, own.alpha_limit, own.has_low_pass, empty)
+        return Elementwise(
+            appearance.texel_position,
+            shade,
+            falloff,
+            appearance.alpha_limit,
+            appearance.has_low_pass,
+            empty=appearance.empty if appearance.texture is None else NEUTRAL_TEXEL,
+        )
 
 
 class _LeftOut:
@@ -158,7 +165,9 @@ def check_shading(static: StaticShading, arguments: Arguments) -> None:
       ValueError: if a result has the wrong form.
       Exception: what the appearance's own code raises, with a note that names it and the arguments.
     """
-    name, functions, num_colors = static.name, arguments.of(()), arguments.num_colors
+    name = static.name
+    functions = arguments.of(())
+    num_colors = arguments.num_colors
 
     def traced(function: str) -> Any:
         """Return what a function of an appearance returns for scalars, without values."""
@@ -186,9 +195,13 @@ def check_shading(static: StaticShading, arguments: Arguments) -> None:
             raise ValueError(f"{must}; the {part} is {described(colors)}, of {described(shaded)}")
     if factor is not None and _sizes((factor,)) != ((),):
         raise ValueError(f"{must}; the factor is {described(factor)}")
-    if _sizes((weight := traced("falloff"),)) != ((),):
+    weight = traced("falloff")
+    if _sizes((weight,)) != ((),):
         raise ValueError(f"{name}.falloff must return one number for one rho; it returned {described(weight)}")
-    if "texel_position" in functions and _sizes(position := traced("texel_position")) != ((), ()):
+    if "texel_position" not in functions:
+        return
+    position = traced("texel_position")
+    if _sizes(position) != ((), ()):
         raise ValueError(f"{name}.texel_position must return (x, y), two numbers; it returned {described(position)}")
 
 
@@ -208,12 +221,12 @@ def takes_arrays(static: StaticShading, arguments: Arguments) -> bool:
     A matrix product in `shade` takes scalars only: with arrays of pixels it would contract the pixels.
     """
     shapes = ODD_SHAPE, (arguments.num_colors, *ODD_SHAPE)
-    for name, given in arguments.of(ODD_SHAPE).items():
+    for name, arrays in arguments.of(ODD_SHAPE).items():
         try:
-            results = jax.make_jaxpr(getattr(static.functions, name))(*given).jaxpr.outvars
+            results = jax.make_jaxpr(getattr(static.functions, name))(*arrays).jaxpr.outvars
         except Exception:  # Any error of the user's code: it has passed with scalars, so it cannot take arrays.
             return False
-        if not all(isinstance(own, jax.extend.core.Literal) or own.aval.shape in shapes for own in results):
+        if not all(isinstance(x, jax.extend.core.Literal) or x.aval.shape in shapes for x in results):
             return False
     return True
 
@@ -224,8 +237,8 @@ def elementwise_functions(static: StaticShading, arguments: Arguments) -> Elemen
     if takes_arrays(static, arguments):
         return functions
 
-    def shade(*given: Any) -> tuple[Residual, Factor, Tint]:
-        residual, factor, tint = functions.shade(*given)
+    def shade(*scalars: Any) -> tuple[Residual, Factor, Tint]:
+        residual, factor, tint = functions.shade(*scalars)
         return None if residual is None else tuple(residual), factor, None if tint is None else tuple(tint)
 
     return functions._replace(
@@ -235,9 +248,9 @@ def elementwise_functions(static: StaticShading, arguments: Arguments) -> Elemen
     )
 
 
-def _mapped(function: Callable[..., object], *given: object) -> Any:
+def _mapped(function: Callable[..., object], *arrays: object) -> Any:
     """Call a function of scalars for each entry of arrays that broadcast."""
-    leaves, structure = jax.tree.flatten(given)
+    leaves, structure = jax.tree.flatten(arrays)
     shape = jnp.broadcast_shapes(*(jnp.shape(leaf) for leaf in leaves))
     flat = [jnp.broadcast_to(leaf, shape).reshape(-1) for leaf in leaves]
     results = jax.vmap(lambda *scalars: function(*jax.tree.unflatten(structure, scalars)))(*flat)

@@ -37,17 +37,19 @@ def arrays_of(appearance: Appearance, sh_degree: int) -> dict[str, np.ndarray]:
     """Return named arrays without padding, which `with_arrays` reads (host). All rows of the appearance exist;
     `sh_degree` is the degree of their own spherical harmonics."""
     arrays: dict[str, np.ndarray] = {}
-    if appearance.bands is not None and (coefficients := appearance.bands.coefficients) is not None:
-        degrees, dense = degrees_of_sizes(coefficients.sizes, sh_degree), dense_bands(coefficients, sh_degree)
+    coefficients = appearance.coefficients
+    if coefficients is not None:
+        degrees = degrees_of_sizes(coefficients.sizes, sh_degree)
+        dense = dense_bands(coefficients, sh_degree)
         arrays |= {"degrees": degrees.astype(np.uint8), "base_degree": np.asarray(sh_degree, np.uint8)}
         for band in range(sh_degree + 1, MAX_DEGREE + 1):
-            first, last = (NUM_BASES[degree] - NUM_BASES[sh_degree] for degree in (band - 1, band))
             # Rows of the Gaussians that have the band, in their order.
-            arrays[f"band_{band}"] = dense[degrees >= band, first:last]
+            arrays[f"band_{band}"] = dense[degrees >= band, _columns(band, sh_degree)]
     if appearance.exponents is not None:
         arrays["shapes"] = np.asarray(appearance.exponents.shapes)
-    if appearance.texture is not None and (texels := appearance.texture.texels) is not None:
-        arrays |= {"sizes": texels.sizes, "texels": texels.flat()}
+    if appearance.texture is not None and appearance.texture.texels is not None:
+        textures = appearance.texture.texels
+        arrays |= {"sizes": textures.sizes, "texels": textures.flat()}
     for field in own_fields(appearance):
         for path, leaf in jax.tree_util.tree_leaves_with_path(getattr(appearance, field), is_leaf=is_table):
             name = field + jax.tree_util.keystr(path)
@@ -66,7 +68,7 @@ def with_arrays(template: Appearance, arrays: Mapping[str, np.ndarray], sh_degre
     if template.bands is not None:
         changes["bands"] = Bands(_coefficients(arrays, sh_degree))
     if template.exponents is not None:
-        shapes = _found(arrays, "shapes")
+        shapes = _array(arrays, "shapes")
         if shapes.ndim != 1 or not np.issubdtype(shapes.dtype, np.floating):
             raise ValueError(f"shapes must be floats [N]; got {shapes.dtype}{list(shapes.shape)}")
         changes["exponents"] = Exponents(jnp.asarray(shapes))
@@ -74,41 +76,43 @@ def with_arrays(template: Appearance, arrays: Mapping[str, np.ndarray], sh_degre
         changes["texture"] = dataclasses.replace(template.texture, texels=_textures(arrays, "sizes", "texels"))
     # Two rows are enough to learn the structure of a subclass's arrays and the shape of a row.
     example = allocate_appearance(template, jax.random.key(0), no_rows(2, 1))
-    own = own_fields(template)
+    added = own_fields(template)
 
     def read(path: Any, leaf: Any) -> Any:
         name = jax.tree_util.keystr(path).removeprefix(".")
-        if path[0].name not in own:
+        if path[0].name not in added:
             return leaf
         if is_shared(leaf):
             return jax.tree_util.tree_map_with_path(lambda inner, array: read_shared((*path, *inner), array), leaf)
         if isinstance(leaf, Table):
-            old = f"{name}.sizes" not in arrays  # Version 0.2, of the pictures of billboards.
-            return _textures(arrays, *(("sizes", "texels") if old else (f"{name}.sizes", f"{name}.elements")))
-        array = _found(arrays, name)
+            if f"{name}.sizes" not in arrays:  # Version 0.2 named the pictures of billboards like textures.
+                return _textures(arrays, "sizes", "texels")
+            return _textures(arrays, f"{name}.sizes", f"{name}.elements")
+        array = _array(arrays, name)
         if array.shape[1:] != leaf.shape[1:]:
             raise ValueError(f"{name} must be [N, …] with rows {leaf.shape[1:]}; got {array.shape}")
         return jnp.asarray(array)
 
     def read_shared(path: Any, leaf: Any) -> Any:
         name = jax.tree_util.keystr(path).removeprefix(".")
-        array = _found(arrays, name)
+        array = _array(arrays, name)
         if array.shape != leaf.shape:
             raise ValueError(f"{name} must be {[*leaf.shape]}, as the appearance allocates it; got {[*array.shape]}")
         return jnp.asarray(array)
 
-    found = jax.tree_util.tree_map_with_path(read, example, is_leaf=is_whole)
-    return dataclasses.replace(template, **changes, **{field: getattr(found, field) for field in own})
+    filled = jax.tree_util.tree_map_with_path(read, example, is_leaf=is_whole)
+    return dataclasses.replace(template, **changes, **{field: getattr(filled, field) for field in added})
 
 
-def _found(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
+def _array(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
     if name not in arrays:
         raise ValueError(f"the array {name} of the appearance is missing")
     return arrays[name]
 
 
 def _textures(arrays: Mapping[str, np.ndarray], sizes_name: str, texels_name: str) -> Textures:
-    sizes, texels = _found(arrays, sizes_name), _found(arrays, texels_name)
+    sizes = _array(arrays, sizes_name)
+    texels = _array(arrays, texels_name)
     is_size = sizes.ndim == 2 and sizes.shape[1] == 2 and np.issubdtype(sizes.dtype, np.integer)
     if not is_size or (sizes.size and not 0 <= sizes.min() <= sizes.max() <= MAX_SIDE):
         raise ValueError(f"{sizes_name} must be integers [N, 2] in 0..{MAX_SIDE}; got {sizes.dtype} {sizes.shape}")
@@ -118,19 +122,28 @@ def _textures(arrays: Mapping[str, np.ndarray], sizes_name: str, texels_name: st
 
 
 def _coefficients(arrays: Mapping[str, np.ndarray], sh_degree: int) -> Coefficients:
-    degrees, base = _found(arrays, "degrees"), int(_found(arrays, "base_degree"))
+    degrees = _array(arrays, "degrees")
+    base = int(_array(arrays, "base_degree"))
     if degrees.ndim != 1 or not np.issubdtype(degrees.dtype, np.integer) or not 0 <= base <= MAX_DEGREE:
         raise ValueError(f"degrees must be integers [N] above a base degree in 0..3; got {degrees.shape}, {base}")
     if base != sh_degree:
         raise ValueError(f"bands are above degree {base}, but the Gaussians have degree {sh_degree}")
-    degrees, dtype = degrees.astype(np.int64), np.dtype(np.float32)
+    degrees = degrees.astype(np.int64)
+    dtype = np.dtype(np.float32)
     bands = {}
     for band in range(base + 1, MAX_DEGREE + 1):
-        found, wanted = arrays.get(f"band_{band}"), (int(np.count_nonzero(degrees >= band)), 2 * band + 1, 3)
-        if found is None or found.shape != wanted:
-            raise ValueError(f"band_{band} must be {list(wanted)}; got {None if found is None else found.shape}")
-        bands[band], dtype = found, found.dtype
+        array = arrays.get(f"band_{band}")
+        shape = (int(np.count_nonzero(degrees >= band)), 2 * band + 1, 3)
+        if array is None or array.shape != shape:
+            raise ValueError(f"band_{band} must be {list(shape)}; got {None if array is None else array.shape}")
+        bands[band] = array
+        dtype = array.dtype
     dense = np.zeros((len(degrees), NUM_BASES[MAX_DEGREE] - NUM_BASES[base], 3), dtype)
-    for band, found in bands.items():
-        dense[degrees >= band, NUM_BASES[band - 1] - NUM_BASES[base] : NUM_BASES[band] - NUM_BASES[base]] = found
+    for band, array in bands.items():
+        dense[degrees >= band, _columns(band, base)] = array
     return bands_of_dense(dense, degrees, base)
+
+
+def _columns(band: int, base: int) -> slice:
+    """Return the columns of a band in `dense_bands`."""
+    return slice(NUM_BASES[band - 1] - NUM_BASES[base], NUM_BASES[band] - NUM_BASES[base])

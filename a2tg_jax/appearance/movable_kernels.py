@@ -67,9 +67,9 @@ class MovableKernels(Appearance):
     ) -> tuple[Residual, Factor]:
         totals = [jnp.zeros_like(u)] * 4
         for first in range(0, len(numbers), FLOATS_PER_KERNEL):
-            x, y, sharpness, *shown = numbers[first : first + FLOATS_PER_KERNEL]
+            x, y, sharpness, *values_shown = numbers[first : first + FLOATS_PER_KERNEL]
             weight = jnp.exp(-sharpness * ((u - x) * (u - x) + (v - y) * (v - y))) + LEAST_WEIGHT
-            totals = [total + weight * number for total, number in zip(totals, shown, strict=True)]
+            totals = [total + weight * number for total, number in zip(totals, values_shown, strict=True)]
         opacity, red, green, blue = (total * (1 / NUM_KERNELS) for total in totals)
         return (red, green, blue), opacity
 
@@ -79,7 +79,8 @@ class MovableKernels(Appearance):
 
     def allocate(self, key: Array, gaussians: Gaussians) -> "MovableKernels":
         """Return colourless kernels around the mean. Together they are as opaque there as the Gaussian, up to 0.82."""
-        num, dtype = gaussians.num, gaussians.means.dtype
+        num = gaussians.num
+        dtype = gaussians.means.dtype
         centers = jnp.asarray(INITIAL_CENTERS, dtype)
         # The mean is at a squared distance of 2 from each initial centre.
         weight_at_mean = float(np.exp(-2 * INITIAL_SHARPNESS)) + LEAST_WEIGHT
@@ -105,9 +106,9 @@ class MovableKernels(Appearance):
 
     def share(self, gaussians: Gaussians, num_shares: Array) -> tuple[Gaussians, "MovableKernels"]:
         """Share the mean opacity of the kernels like a Gaussian's opacity; all kernels fade by one factor."""
-        before = self.opacities(gaussians)
-        logits, log_scales = share(logit(before), gaussians.log_scales, num_shares)
-        faded = self.kernel_opacities * (jax.nn.sigmoid(logits) / before)[:, None]
+        opacities = self.opacities(gaussians)
+        logits, log_scales = share(logit(opacities), gaussians.log_scales, num_shares)
+        faded = self.kernel_opacities * (jax.nn.sigmoid(logits) / opacities)[:, None]
         is_shared = (num_shares > 1)[:, None]
         logits = jnp.where(is_shared, logit(jnp.minimum(faded, LARGEST_OPACITY)), self.logit_opacities)
         return (

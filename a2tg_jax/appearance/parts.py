@@ -59,8 +59,10 @@ Shading = tuple[Residual, Factor] | tuple[Residual, Factor, Tint]
 # stores textures, `core.bilinear` interpolates them. The renderer gets all of them one after the other as texels
 # [T, 4], each row by row.
 
-LEAST_EXTENT, MOST_EXTENT = 1e-3, 1e3
-"""Range of half the side of a texture: float32 keeps lookups exact in it, and no kernel is as wide as its end."""
+LEAST_EXTENT = 1e-3
+"""Least half side of a texture, for which float32 still keeps lookups exact."""
+MOST_EXTENT = 1e3
+"""Largest half side of a texture, wider than any kernel."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,8 +144,8 @@ class Texture(Part):
 
     def project(self) -> "Texture":
         """Return textures with alpha factors clamped to [0, 1], and RGB as well if it is unsigned."""
-        # What `shown` would clip is clipped here as well, which changes no image: beyond the bounds, where gradients
-        # are 0, texels would stay forever. Alpha that is divided by its maximum has no upper bound.
+        # Clips what `shown` clips, which changes no image: gradients are 0 beyond the bounds, and texels could not
+        # return. Alpha that is divided by its maximum has no upper bound.
         options = self.options
         most_alpha = jnp.inf if options.alpha == "global-maximum" else 1.0
         least, most = (0.0, 1.0) if options.rgb == "unit" else (-jnp.inf, jnp.inf)
@@ -155,7 +157,8 @@ class Texture(Part):
     def shown(self) -> Textures:
         """Return RGB residuals and alpha factors as they are shown. Buckets and rows out of range are clamped."""
         assert self.texels is not None
-        textures, options = self.texels.nearest_places(), self.options
+        textures = self.texels.nearest_places()
+        options = self.options
         if options.rgb == "signed" and options.alpha == "projected":
             return textures
         divisor = None
@@ -169,7 +172,8 @@ class Texture(Part):
             divisor = jnp.max(jnp.concatenate(alphas)) + 1e-6
 
         def shown(texels: Array) -> Array:
-            rgb, alpha = texels[..., :3], texels[..., 3:]
+            rgb = texels[..., :3]
+            alpha = texels[..., 3:]
             rgb = within(rgb, 0.0, 1.0) if options.rgb == "unit" else rgb
             alpha = alpha if divisor is None else within(alpha / divisor, 0.0, 1.0)
             return jnp.concatenate([rgb, alpha], axis=-1)
@@ -183,7 +187,8 @@ class Texture(Part):
         areas = [height * width for height, width in textures.bucket_sizes]
         capacities = [bucket.shape[0] for bucket in textures.buckets]
         starts = np.cumsum([0] + [capacity * area for capacity, area in zip(capacities, areas, strict=True)])[:-1]
-        bucket_starts, bucket_areas = jnp.asarray(starts, jnp.int32), jnp.asarray(areas, jnp.int32)
+        bucket_starts = jnp.asarray(starts, jnp.int32)
+        bucket_areas = jnp.asarray(areas, jnp.int32)
         sizes = jnp.asarray(textures.bucket_sizes, jnp.int32)[textures.bucket]
         offsets = bucket_starts[textures.bucket] + textures.row * bucket_areas[textures.bucket]
         texels = [bucket.reshape(-1, 4) for bucket in textures.buckets if bucket.size]
@@ -193,13 +198,14 @@ class Texture(Part):
     def peaks(self) -> Array:
         """Return the largest alpha factor [N] of each splat; only for bounds, without gradient."""
         textures = self.shown()
-        most, columns = max(map(len, textures.buckets)), []
+        most = max(map(len, textures.buckets))
+        columns = []
         for bucket in textures.buckets:  # 1 of an empty texture, 0 past the capacity.
-            own = jnp.max(bucket[..., 3], axis=(1, 2)) if bucket.size else jnp.ones(most, bucket.dtype)
-            columns.append(jnp.pad(own, (0, most - len(own))))
+            largest = jnp.max(bucket[..., 3], axis=(1, 2)) if bucket.size else jnp.ones(most, bucket.dtype)
+            columns.append(jnp.pad(largest, (0, most - len(largest))))
         peaks = jnp.stack(columns)
         peaks = jax.lax.stop_gradient(peaks[textures.bucket, textures.row])
-        # Outside such a texture the factor is 1.
+        # Outside a texture with this option the factor is 1.
         return jnp.maximum(peaks, 1.0) if self.options.outside == "identity" else peaks
 
     # Element-wise, without the texels
@@ -208,7 +214,8 @@ class Texture(Part):
         """Return the lookup position (x, y) in texels, clamped to [0, width − 1] and [0, height − 1]."""
         if not self.options.uv_gradient:
             u, v = jax.lax.stop_gradient((u, v))
-        width, height = region.width.astype(u.dtype), region.height.astype(v.dtype)
+        width = region.width.astype(u.dtype)
+        height = region.height.astype(v.dtype)
         return texel_coordinates(u, width, self.options), texel_coordinates(v, height, self.options)
 
     def shade(self, values: tuple[Array, ...], u: Array, v: Array) -> tuple[Residual, Factor]:
@@ -261,8 +268,8 @@ class Exponents(Part):
 
     def check(self, gaussians: Gaussians) -> None:
         if self.shapes is None or self.shapes.shape != (gaussians.num,):
-            found = None if self.shapes is None else list(self.shapes.shape)
-            raise ValueError(f"shapes must be [{gaussians.num}], one for each Gaussian; got {found}")
+            shape = None if self.shapes is None else list(self.shapes.shape)
+            raise ValueError(f"shapes must be [{gaussians.num}], one for each Gaussian; got {shape}")
 
 
 class Curve(NamedTuple):
@@ -326,13 +333,15 @@ class Coefficients(Table):
 
     @classmethod
     def placed(cls, buckets: Sequence[Any], places: Places) -> Self:
-        bucket, row, num = np.asarray(places.bucket), np.asarray(places.row), places.bucket.shape[0]
+        bucket = np.asarray(places.bucket)
+        row = np.asarray(places.row)
+        num = places.bucket.shape[0]
         owners = []
         for index, blocks in enumerate(buckets):
             # N is out of range, so that scatters drop padding.
-            own = np.full(len(blocks), num, np.int32)
-            own[row[bucket == index]] = np.flatnonzero(bucket == index)
-            owners.append(jax.device_put(own))
+            owner = np.full(len(blocks), num, np.int32)
+            owner[row[bucket == index]] = np.flatnonzero(bucket == index)
+            owners.append(jax.device_put(owner))
         return dataclasses.replace(super().placed(buckets, places), owners=tuple(owners))
 
     @staticmethod
@@ -358,7 +367,8 @@ class Bands(Part):
         check_table(self.coefficients, gaussians.num, "bands.coefficients")
         check_places(self.coefficients, "bands.coefficients")
         possible = {number - NUM_BASES[gaussians.sh_degree] for number in NUM_BASES[gaussians.sh_degree :]}
-        if unknown := {size for (size,) in self.coefficients.bucket_sizes} - possible:
+        unknown = {size for (size,) in self.coefficients.bucket_sizes} - possible
+        if unknown:
             raise ValueError(
                 f"bands.coefficients have blocks of {min(unknown)} coefficients, which no degree above "
                 f"{gaussians.sh_degree}, the degree of the Gaussians, has"
@@ -369,7 +379,9 @@ class Bands(Part):
 
         The camera's centre is [3]; the highest degree may be traced.
         """
-        table, base, means = self.coefficients, gaussians.sh_degree, gaussians.means
+        table = self.coefficients
+        base = gaussians.sh_degree
+        means = gaussians.means
         assert table is not None
         total = jnp.zeros(means.shape, jnp.result_type(means, center, *table.buckets))
         for blocks, owners in zip(table.buckets, table.owners, strict=True):
@@ -380,13 +392,14 @@ class Bands(Part):
             bases = sh_basis(directions, blocks.shape[1] + NUM_BASES[base])
             colors = jnp.zeros((len(blocks), 3), total.dtype)
             for band in range(base + 1, MAX_DEGREE + 1):
-                first, last = NUM_BASES[band - 1], NUM_BASES[band]
+                first = NUM_BASES[band - 1]
+                last = NUM_BASES[band]
                 # Blocks have all bands up to a degree.
                 if blocks.shape[1] < last - NUM_BASES[base]:
                     break
                 basis = jnp.where(jnp.asarray(degree) >= band, bases[:, first:last], 0.0)
-                own = blocks[:, first - NUM_BASES[base] : last - NUM_BASES[base]]
-                colors = colors + jnp.sum(basis[:, :, None] * own, axis=1)
+                coefficients = blocks[:, first - NUM_BASES[base] : last - NUM_BASES[base]]
+                colors = colors + jnp.sum(basis[:, :, None] * coefficients, axis=1)
             total = total.at[owners].add(colors, mode="drop")
         return total
 
@@ -436,21 +449,24 @@ def bands_of_dense(dense: np.ndarray, degrees: np.ndarray, base_degree: int) -> 
 # ⟨g, g⟩ = k, and the best k maximises ⟨f, g⟩²/k. Both are tabulated over the logarithm of the exponent.
 
 LEAST_OPACITY = 1e-6
-NUM_SHAPES, NUM_SCALES, NUM_PLACES = 41, 121, 2001
+NUM_SHAPES = 41
+NUM_SCALES = 121
+NUM_PLACES = 2001
 LARGEST_PLACE = 12.0
 """Distance, in standard deviations, up to which kernels are compared."""
-LEAST_LOG_SCALE, MOST_LOG_SCALE = -0.3, 0.9
-"""Range of the logarithms of √k."""
+LEAST_LOG_SCALE = -0.3
+"""Least logarithm of √k."""
+MOST_LOG_SCALE = 0.9
 
 
 def nearest_gaussians(gaussians: Gaussians, shapes: np.ndarray) -> Gaussians:
     """Return the Gaussians nearest to kernels of the given shapes [N]: other scales and opacities (host)."""
-    log_exponents, peaks, log_scales = _table()
-    own = log_exponents_of(shapes)
-    opacities = np.asarray(gaussians.opacities, np.float64) * np.interp(own, log_exponents, peaks)
+    tabulated, peaks, log_scales = _table()
+    log_exponents = log_exponents_of(shapes)
+    opacities = np.asarray(gaussians.opacities, np.float64) * np.interp(log_exponents, tabulated, peaks)
     dtype = gaussians.means.dtype
     limited = jnp.asarray(np.clip(opacities, LEAST_OPACITY, LARGEST_OPACITY), dtype)
-    larger = np.asarray(gaussians.log_scales) + np.interp(own, log_exponents, log_scales)[:, None]
+    larger = np.asarray(gaussians.log_scales) + np.interp(log_exponents, tabulated, log_scales)[:, None]
     return dataclasses.replace(gaussians, logit_opacities=logit(limited), log_scales=jnp.asarray(larger, dtype))
 
 

@@ -5,6 +5,7 @@ element-wise, on scalars or on arrays that broadcast. (x, y) counts texels from 
 [0, width − 1] × [0, height − 1]. `rasterize.kernels.native.texture_lookups` does the same for vectors of pixels.
 """
 
+import operator
 from typing import NamedTuple
 
 import jax
@@ -29,7 +30,7 @@ def within_texels(regions: TextureRegion, num_texels: int) -> TextureRegion:
     height = jnp.where(regions.width > 0, jnp.clip(regions.height, 0, num_texels), 0)
     width = jnp.where(height > 0, jnp.clip(regions.width, 0, num_texels // jnp.maximum(height, 1)), 0)
     first = jnp.clip(regions.first, 0, num_texels - height * width)
-    return TextureRegion(*(numbers.astype(jnp.int32) for numbers in (first, height, width)))
+    return TextureRegion(first.astype(jnp.int32), height.astype(jnp.int32), width.astype(jnp.int32))
 
 
 class Corner(NamedTuple):
@@ -59,17 +60,22 @@ class Lookup(NamedTuple):
 
 def corners_of(region: TextureRegion, x: Array, y: Array) -> tuple[Corner, ...]:
     """Return the texels above left, above right, below left and below right of (x, y); weight 0 without a texture."""
-    right_most, bottom_most = jnp.maximum(region.width - 1, 0), jnp.maximum(region.height - 1, 0)
+    right_most = jnp.maximum(region.width - 1, 0)
+    bottom_most = jnp.maximum(region.height - 1, 0)
     # Clipped, so that no x or y reads outside the texture.
     left = jnp.clip(jnp.floor(x).astype(jnp.int32), 0, right_most)
     top = jnp.clip(jnp.floor(y).astype(jnp.int32), 0, bottom_most)
-    # Beyond the last texel the weight is 0, because x <= width − 1: any index inside will do.
-    right, bottom = jnp.minimum(left + 1, right_most), jnp.minimum(top + 1, bottom_most)
-    above, below = region.first + top * region.width, region.first + bottom * region.width
+    # Beyond the last texel the weight is 0, because x <= width − 1: any index inside is right.
+    right = jnp.minimum(left + 1, right_most)
+    bottom = jnp.minimum(top + 1, bottom_most)
+    above = region.first + top * region.width
+    below = region.first + bottom * region.width
     exists = (region.width > 0).astype(x.dtype)
     # Without a texture all four weights are 0, and nothing is read into the sum.
-    fx, fy = exists * (x - left.astype(x.dtype)), exists * (y - top.astype(y.dtype))
-    gx, gy = exists - fx, exists - fy
+    fx = exists * (x - left.astype(x.dtype))
+    fy = exists * (y - top.astype(y.dtype))
+    gx = exists - fx
+    gy = exists - fy
     # The slopes follow from ∂fx/∂x = 1 and ∂gx/∂x = −1.
     return (
         Corner(above + left, gx * gy, -gy, -gx),
@@ -82,27 +88,31 @@ def corners_of(region: TextureRegion, x: Array, y: Array) -> tuple[Corner, ...]:
 def interpolate(corners: tuple[Corner, ...], texels: tuple[tuple[Array, ...], ...]) -> Sample:
     """Return the sample, given the C numbers of each corner's texel."""
 
-    def weighed(weights: list[Array]) -> tuple[Array, ...]:
-        return tuple(
-            sum(weight * number for weight, number in zip(weights, column, strict=True))
-            for column in zip(*texels, strict=True)
-        )
+    columns = list(zip(*texels, strict=True))
 
-    return Sample(*(weighed([corner[k] for corner in corners]) for k in (1, 2, 3)))
+    def weighed(weights: list[Array]) -> tuple[Array, ...]:
+        return tuple(sum(map(operator.mul, weights, column)) for column in columns)
+
+    return Sample(
+        values=weighed([corner.weight for corner in corners]),
+        slope_x=weighed([corner.slope_x for corner in corners]),
+        slope_y=weighed([corner.slope_y for corner in corners]),
+    )
 
 
 def or_empty(sample: Sample, region: TextureRegion, empty: tuple[float, ...]) -> Sample:
     """Return the sample, or the values `empty` if the region has no texels."""
-    # Every splat has a texture then: kernels need no test.
+    # Then every splat has a texture, and kernels need no test.
     if not empty:
         return sample
     values = zip(empty, sample.values, strict=True)
-    return sample._replace(values=tuple(jnp.where(region.width > 0, value, none) for none, value in values))
+    return sample._replace(values=tuple(jnp.where(region.width > 0, value, default) for default, value in values))
 
 
 def follow(sample: Sample, x: Array, y: Array) -> tuple[Array, ...]:
     """Return the sample's values, differentiable in (x, y)."""
-    # Both are 0, and carry the derivative: texels are read once, and JAX need not differentiate the lookup itself.
-    dx, dy = x - jax.lax.stop_gradient(x), y - jax.lax.stop_gradient(y)
+    # Both are 0 and only carry the derivative: texels are read once, and JAX does not differentiate the lookup itself.
+    dx = x - jax.lax.stop_gradient(x)
+    dy = y - jax.lax.stop_gradient(y)
     columns = zip(*sample, strict=True)
     return tuple(value + slope_x * dx + slope_y * dy for value, slope_x, slope_y in columns)

@@ -20,8 +20,8 @@ MEGABYTES = {
 }  # fmt: skip
 """Megabytes of each unit; a number without a unit is in megabytes."""
 MOST_ROOM = 0.5
-"""Largest tables of degrees or textures, padding included, as a share of the budget, that are allocated before a stage
-so that its programs need not be compiled again when they fill."""
+"""Largest share of a budget that tables of degrees or textures, padding included, may take when they are allocated
+before a stage, so that they can fill without another compilation."""
 LARGEST_SHORTFALL = 0.005
 """Largest unused fraction of a budget without a warning."""
 
@@ -34,9 +34,9 @@ def megabytes_of(budget: float | str | None, name: str = "memory_budget") -> flo
     """
     if budget is None or budget == "None":
         return None
-    found = re.fullmatch(r"\s*([0-9.]+(?:e[+-]?[0-9]+)?)\s*([a-z]*)\s*", str(budget).lower())
+    match = re.fullmatch(r"\s*([0-9.]+(?:e[+-]?[0-9]+)?)\s*([a-z]*)\s*", str(budget).lower())
     try:
-        number, unit = found.groups() if found else ("", "")
+        number, unit = match.groups() if match else ("", "")
         # As floats, 33.3 kB would be 0.033299999999999996 MB, in messages as well.
         megabytes = float(decimal.Decimal(number) * decimal.Decimal(MEGABYTES[unit]))
     except (KeyError, decimal.InvalidOperation):
@@ -70,11 +70,11 @@ def number_to_reach(num: Array, cap: int, num_left: Integer) -> Array:
 
     ⌈n·(cap/n)^(1/r)⌉: every event grows the present number n, at most the cap, by the same factor. Traceable.
     """
-    now = num.astype(jnp.result_type(float))
-    exponent = 1 / jnp.maximum(jnp.asarray(num_left, jnp.int32), 1).astype(now.dtype)
-    wanted = jnp.ceil(now * (cap / jnp.maximum(now, 1)) ** exponent)
+    present = num.astype(jnp.result_type(float))
+    exponent = 1 / jnp.maximum(jnp.asarray(num_left, jnp.int32), 1).astype(present.dtype)
+    grown = jnp.ceil(present * (cap / jnp.maximum(present, 1)) ** exponent)
     # Powers are rounded: the last event is a separate case, so that it reaches the cap exactly.
-    return jnp.where(num_left > 1, jnp.clip(wanted.astype(jnp.int32), num, cap), cap)
+    return jnp.where(num_left > 1, jnp.clip(grown.astype(jnp.int32), num, cap), cap)
 
 
 def within_budget(statistic: np.ndarray, can_grow: np.ndarray, cost: np.ndarray, budget_bytes: float) -> np.ndarray:

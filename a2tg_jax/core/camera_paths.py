@@ -28,9 +28,12 @@ LEAST_FACING = 0.5
 """Smallest median cosine between optical axes and the directions to the subject."""
 FEWEST_TO_COMPARE = 5
 """Smallest number of cameras of which one may count as outlying."""
-FAR, FARTHEST, LARGEST_MISS = 5.0, 30.0, 3.0
-"""Distances from which on cameras are outlying if their axes miss the others by more than `LARGEST_MISS`, and in any
-case, in units of the distance at which the others see their subject: a thirtieth of the size it has for these."""
+FAR = 5.0
+"""Distance beyond which a camera is outlying if its axis also misses the others by more than `LARGEST_MISS`; like the
+next two, in units of the distance of the other cameras from their subject."""
+FARTHEST = 30.0
+"""Distance beyond which a camera is outlying in any case: it sees the subject at a thirtieth of the others' size."""
+LARGEST_MISS = 3.0
 LARGEST_ELEVATION = np.radians(80)  # a camera straight above has no level horizon (`looking`)
 FEWEST = 4
 """Smallest number of cameras whose right axes are trusted over their mean up."""
@@ -68,11 +71,11 @@ def distance_to_subject(viewmats: np.ndarray) -> float:
 
 
 def outlying_cameras(viewmats: np.ndarray, distance_of: Callable[[np.ndarray], float] | None = None) -> np.ndarray:
-    """Return [V] bool, True for cameras [V, 4, 4] so far from the others that they cannot show the same, as wrong poses
-    are.
+    """Return [V] bool, True for cameras [V, 4, 4] that are too far from the others to show the same subject, mostly
+    because their poses are wrong.
 
-    At most a third is. A gap separates them: the nearest of them is `FAR` times as far from the middle as any of the
-    others, and as the others' subject from these. Trajectories of any length have no such gap.
+    At most a third of the cameras are outlying, and a gap separates them: even the nearest of them is `FAR` times as
+    far from the middle as all others are, and as these are from their subject. A long trajectory has no such gap.
 
     Args:
       viewmats: world-to-camera matrices.
@@ -95,8 +98,9 @@ def outlying_cameras(viewmats: np.ndarray, distance_of: Callable[[np.ndarray], f
         # All others at one place, such as a panorama, have no extent to compare with.
         if not 0 < FAR * extent < distances[rest[0]]:
             continue
-        seen = distance_to_subject(viewmats[others]) if distance_of is None else distance_of(others)
-        reach, far = (extent, FARTHEST) if np.isnan(seen) else (max(extent, seen), FAR)
+        distance = distance_to_subject(viewmats[others]) if distance_of is None else distance_of(others)
+        reach = extent if np.isnan(distance) else max(extent, distance)
+        far = FARTHEST if np.isnan(distance) else FAR
         is_far = (distances > far * reach) & (misses > LARGEST_MISS * reach)
         is_outlying[rest] = ((distances > FARTHEST * reach) | is_far)[rest]
         if is_outlying.any():
@@ -125,7 +129,7 @@ def vertical_of(viewmats: np.ndarray) -> np.ndarray:
     is_open = middle < LEAST_SPREAD or least > LARGEST_RATIO * middle
     if len(viewmats) < FEWEST or is_open or abs(axis @ up) < LEAST_COSINE:
         return up
-    # An eigenvector has no sign of its own.
+    # The sign of an eigenvector is arbitrary.
     return np.asarray(axis * np.sign(axis @ up))
 
 
@@ -141,8 +145,8 @@ def upright_rotation(vertical: np.ndarray) -> np.ndarray:
     """Return the rotation [3, 3] from a world with this vertical [3] to one whose −y is up, as programs for splats
     expect.
 
-    The axis nearest to the vertical is turned first, as between worlds of y and z up, and half about z where y points
-    down: the axes of a capture that is upright only change their names. The shortest rotation then does the rest.
+    First, quarter or half turns lead the coordinate axis nearest to the vertical to −y, so that an upright capture only
+    swaps its axes. The shortest rotation corrects what remains.
     """
     up = vertical / np.linalg.norm(vertical)
     nearest = np.eye(3)[np.abs(up).argmax()] * np.sign(up[np.abs(up).argmax()])
@@ -161,7 +165,8 @@ def _shortest_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
 def central_camera(viewmats: np.ndarray) -> int:
     """Return the index of the camera [V, 4, 4] whose axis passes nearest to the subject and which is nearest to the
     median camera, with equal weight."""
-    centers, axes = camera_centers(viewmats), viewmats[:, 2, :3]
+    centers = camera_centers(viewmats)
+    axes = viewmats[:, 2, :3]
     subject = nearest_point(centers, axes)
     misses = np.linalg.norm(np.cross(subject - centers, axes), axis=1)
     remote = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
@@ -182,8 +187,10 @@ def turntable(cameras: Sequence[Camera], num_frames: int, up: np.ndarray | None 
         raise ValueError(f"an orbit needs a camera and a frame; got {len(cameras)} cameras, {num_frames} frames")
     cameras = without_outlying(cameras)
     viewmats = _viewmats(cameras)
-    centers, axes = camera_centers(viewmats), viewmats[:, 2, :3]
-    subject, up = nearest_point(centers, axes), vertical_of(viewmats) if up is None else up
+    centers = camera_centers(viewmats)
+    axes = viewmats[:, 2, :3]
+    subject = nearest_point(centers, axes)
+    up = vertical_of(viewmats) if up is None else up
     offsets = centers - subject
     distances = np.maximum(np.linalg.norm(offsets, axis=1), 1e-12)
     if np.median(-np.sum(offsets * axes, axis=1) / distances) < LEAST_FACING:
@@ -197,7 +204,8 @@ def turntable(cameras: Sequence[Camera], num_frames: int, up: np.ndarray | None 
         if np.linalg.norm(across) > 1e-3 * np.linalg.norm(vector):
             break
     side = across / np.linalg.norm(across)
-    first, place = cameras[0], distances.mean()
+    first = cameras[0]
+    place = distances.mean()
     frames = []
     for angle in np.arange(num_frames) * (2 * np.pi / num_frames):
         heading = np.cos(angle) * side + np.sin(angle) * np.cross(up, side)
@@ -241,14 +249,15 @@ def look_at(
     for name, vector in vectors.items():
         if vector.shape != (3,) or not np.isfinite(vector).all():
             raise ValueError(f"{name} must be 3 finite numbers; got {vector}")
-    center, seen, up = vectors.values()
-    forward = seen - center
+    center, subject, up = vectors.values()
+    forward = subject - center
     if np.linalg.norm(np.cross(forward, up)) <= 1e-6 * np.linalg.norm(forward) * np.linalg.norm(up):
         wanted = f"target must be in a direction that is not along up; it is at {forward} from the camera"
         raise ValueError(f"{wanted}, and up is {up}: pass another up")
     if not 0 < fov < 180:
         raise ValueError(f"fov must be between 0 and 180 degrees; got {fov}")
-    viewmat, K = looking(center, forward, -up), intrinsics(width, height, np.radians(fov))
+    viewmat = looking(center, forward, -up)
+    K = intrinsics(width, height, np.radians(fov))
     # `float` is JAX's default dtype, float64 under x64.
     camera = Camera(jnp.asarray(viewmat, float), jnp.asarray(K, float), width, height)
     check_camera(camera)
@@ -283,7 +292,9 @@ def smooth_path(cameras: Sequence[Camera], num_frames: int) -> list[Camera]:
     if len(cameras) < 2:
         raise ValueError(f"a path needs two cameras; got {len(cameras)}")
     viewmats = _viewmats(cameras)
-    centers, forwards, downs = camera_centers(viewmats), viewmats[:, 2, :3], viewmats[:, 1, :3]
+    centers = camera_centers(viewmats)
+    forwards = viewmats[:, 2, :3]
+    downs = viewmats[:, 1, :3]
     # The tour begins at an end of the set, and always goes to the nearest camera that it has not visited.
     spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max() or 1.0
     # In radii of the capture, so that positions compare with directions.
@@ -345,10 +356,12 @@ def path_through(views: Sequence[Camera], num_frames: int) -> list[Camera]:
     # Splines need increasing times, also where two views are equal.
     knots = np.concatenate([[0.0], np.cumsum(np.maximum(steps, 1e-3))])
     times = np.linspace(0.0, knots[-1], num_frames)
-    places, turned = CubicSpline(knots, centers, bc_type="natural")(times), Slerp(knots, rotations)(times).as_matrix()
+    places = CubicSpline(knots, centers, bc_type="natural")(times)
+    turned = Slerp(knots, rotations)(times).as_matrix()
     Ks = np.stack([np.asarray(view.K, np.float64).ravel() for view in views])
     lenses = _interpolated(times, knots, Ks).reshape(-1, 3, 3)
-    dtype, size = first.viewmat.dtype, (first.width, first.height)
+    dtype = first.viewmat.dtype
+    size = (first.width, first.height)
     return [
         Camera(jnp.asarray(viewmat_of_axes(R, c), dtype), jnp.asarray(K, dtype), *size)
         for R, c, K in zip(turned, places, lenses, strict=True)
@@ -366,6 +379,6 @@ def _lengths(points: np.ndarray, least: float) -> np.ndarray:
     return np.concatenate([[0.0], np.cumsum(steps + least)])
 
 
-def _interpolated(wanted: np.ndarray, known: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return rows of values [n, C] interpolated at the wanted places [m] among the known ones [n]."""
-    return np.stack([np.interp(wanted, known, column) for column in values.T], axis=1)
+def _interpolated(places: np.ndarray, knots: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return rows of values [n, C] at the knots [n], interpolated at places [m]."""
+    return np.stack([np.interp(places, knots, column) for column in values.T], axis=1)

@@ -81,7 +81,7 @@ class Camera(NamedFields):
 def check_camera(camera: Camera, name: str = "camera") -> None:
     """Raise ValueError, naming the field, unless the matrices have their shapes and the image a size.
 
-    The pose must be a rigid motion, and K have the form of intrinsics, which is checked outside jit, vmap and grad.
+    Outside jit, vmap and grad, the pose must also be a rigid motion and K have the form of intrinsics.
     """
     check_is_camera(camera, name)
     for field, shape in (("viewmat", (4, 4)), ("K", (3, 3))):
@@ -95,7 +95,7 @@ def check_camera(camera: Camera, name: str = "camera") -> None:
         if not isinstance(value, int) or value < 1:
             kind = "" if isinstance(value, int) else ", a Python int"
             raise ValueError(f"{name}.{side} must be a positive number of pixels{kind}; got {value!r}")
-    # Both may drift as gradient steps make them; a pose with NaN passes.
+    # Gradient steps may make both drift, within `MAX_DRIFT`; a pose with NaN passes.
     if not isinstance(camera.viewmat, jax.core.Tracer):
         viewmat = np.asarray(jax.device_get(camera.viewmat), np.float64)
         rotation = viewmat[:3, :3]
@@ -153,7 +153,8 @@ def check_intrinsics(K: np.ndarray, width: int, height: int, what: str) -> None:
     if not 1 <= min(width, height) <= side <= LONGEST_SIDE:
         raise ValueError(f"{what}: its image must have sides of 1..{LONGEST_SIDE} pixels; got {width}x{height}")
     K = np.asarray(K, np.float64)
-    focal, offset = K[[0, 1], [0, 1]], K[[0, 1], [2, 2]]
+    focal = K[[0, 1], [0, 1]]
+    offset = K[[0, 1], [2, 2]]
     if not ((focal >= SHORTEST_FOCAL * side) & (focal <= LONGEST_FOCAL * side)).all():  # False for NaN.
         wanted = f"{SHORTEST_FOCAL * side:g}..{LONGEST_FOCAL * side:g} pixels, because its image is {width}x{height}"
         raise ValueError(f"{what}: its focal lengths must be in {wanted}; got {_numbers(focal)}")
@@ -195,15 +196,18 @@ def resize_camera(camera: Camera, width: int, height: int) -> Camera:
 
 def _resampled(values: Array, num: int, axis: int) -> Array:
     """Return values at the centres of `num` pixels along an axis, linear between and beyond the old centres."""
-    old = values.shape[axis]
-    if old == 1 or num == old:
-        return values if num == old else jnp.repeat(values, num, axis=axis)
+    num_old = values.shape[axis]
+    if num_old == num:
+        return values
+    if num_old == 1:
+        return jnp.repeat(values, num, axis=axis)
     # Centres are at +0.5 at both sizes; places count from the centre of the first old pixel.
-    place = (np.arange(num) + 0.5) * (old / num) - 0.5
+    place = (np.arange(num) + 0.5) * (num_old / num) - 0.5
     # Up to the last but one, so that the line through the last two continues beyond them.
-    below = np.clip(np.floor(place), 0, old - 2).astype(np.int32)
+    below = np.clip(np.floor(place), 0, num_old - 2).astype(np.int32)
     share = jnp.asarray(np.expand_dims(place - below, [k for k in range(values.ndim) if k != axis]), values.dtype)
-    low, high = (jnp.take(values, rows, axis=axis) for rows in (below, below + 1))
+    low = jnp.take(values, below, axis=axis)
+    high = jnp.take(values, below + 1, axis=axis)
     return low + share * (high - low)
 
 
@@ -252,14 +256,15 @@ def looking(center: np.ndarray, forward: np.ndarray, down: np.ndarray) -> np.nda
 def viewmat_of_axes(rotation: np.ndarray, center: np.ndarray) -> np.ndarray:
     """Return the world-to-camera matrix [4, 4] of a camera's axes, as rows, and its position."""
     viewmat = np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ center
+    viewmat[:3, :3] = rotation
+    viewmat[:3, 3] = -rotation @ center
     return viewmat
 
 
 def pinhole_pixels(points: np.ndarray, K: np.ndarray) -> np.ndarray:
     """Return x and y [P, 2] in pixels of points [P, 3] in front of a pinhole camera, in its frame."""
-    seen = points @ K.T
-    return seen[:, :2] / seen[:, 2:]
+    projected = points @ K.T
+    return projected[:, :2] / projected[:, 2:]
 
 
 # Small rigid motions of cameras, so(3) × R³: a twist [6] is a rotation vector ω in radians and a translation. θ is the
@@ -278,7 +283,9 @@ def rotation_exp(rotvec: Array) -> Array:
     angle = jnp.sqrt(safe)
     first = jnp.where(is_small, _series(squared, 1, 6, 120, 5040), jnp.sin(angle) / angle)
     second = jnp.where(is_small, _series(squared, 2, 24, 720, 40320), (1 - jnp.cos(angle)) / safe)
-    x, y, z = rotvec[0], rotvec[1], rotvec[2]
+    x = rotvec[0]
+    y = rotvec[1]
+    z = rotvec[2]
     zero = jnp.zeros_like(x)
     W = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
     # W² = ω·ωᵀ − θ²·I, without a product of matrices, which some devices round coarsely.

@@ -16,8 +16,8 @@ import numpy as np
 from jax.typing import DTypeLike
 
 LARGEST_NUMBER = 1e12
-"""Largest magnitude of a number that geometry in float32 carries: products of it with focal lengths, and their
-squares, stay finite, and with them gradients, which overflow from 1e20 on."""
+"""Largest magnitude of numbers in geometry. In float32, their products with focal lengths, the squares of these, and
+the gradients, which overflow from 1e20 on, stay finite."""
 FLOATS = ("float32", "float64")
 """Names of the dtypes that models may have."""
 Wanted = tuple[int | str, ...]
@@ -40,9 +40,10 @@ def check_kind(name: str, value: object, kind: type | tuple[type, ...], hint: st
     if not hint and isinstance(value, type) and issubclass(value, kind):
         hint = f"use {value.__name__}(…)"
     nouns = []
-    for own in (each.__name__ for each in (kind if isinstance(kind, tuple) else (kind,))):
-        article = "" if own.endswith("s") else "an " if own[0] in "AEIOUaeiou" else "a "  # Gaussians have none.
-        nouns.append(f"{article}{own}")
+    for accepted in kind if isinstance(kind, tuple) else (kind,):
+        noun = accepted.__name__
+        article = "an" if noun[0] in "AEIOUaeiou" else "a"
+        nouns.append(noun if noun.endswith("s") else f"{article} {noun}")  # plural, as Gaussians
     raise ValueError(f"{name} must be {' or '.join(nouns)}; got {kind_of(value)}{hint and f': {hint}'}")
 
 
@@ -93,8 +94,8 @@ def check_number(
     limits = {"at least": least, "above": above, "at most": most, "below": below}
     wanted = " and ".join(f"{word} {limit:g}" for word, limit in limits.items() if limit is not None)
     if not _is_numeric(value) or np.shape(value) != ():
-        found = described(value) if hasattr(value, "dtype") else repr(value)
-        raise ValueError(f"{name} must be {f'a number {wanted}'.rstrip()}; got {found}")
+        got = described(value) if hasattr(value, "dtype") else repr(value)
+        raise ValueError(f"{name} must be {f'a number {wanted}'.rstrip()}; got {got}")
     if isinstance(value, jax.core.Tracer):
         return
     number = float(value)
@@ -134,7 +135,7 @@ def plain_array(name: str, value: object, dtype: DTypeLike | None = None) -> Any
     first = value
     while isinstance(first, list | tuple) and first:
         first = first[0]
-    # JAX puts no nested sequences of numbers into a pytree, but other things instead of arrays.
+    # Only lists of numbers: JAX also puts other things in the place of arrays.
     if type(value) in (list, tuple) and isinstance(first, numbers.Number) and not isinstance(first, bool):
         try:
             value = np.asarray(value, jnp.result_type(float) if dtype is None else dtype)
@@ -176,11 +177,13 @@ def check_shape(name: str, x: Any, wanted: Wanted) -> None:
     x is an array, a tracer, or nested sequences of numbers.
     """
     shape = np.shape(x)
-    sizes: dict[int | str, int] = {}
-    pairs = zip(shape, wanted, strict=False)
-    # A number stands for itself, a letter for the first size that it meets.
-    fits = all(sizes.setdefault(side, side if isinstance(side, int) else own) == own for own, side in pairs)
-    if len(shape) != len(wanted) or not fits:
+    sizes: dict[str, int] = {}
+    fits = len(shape) == len(wanted)
+    for size, side in zip(shape, wanted, strict=False):
+        # A letter stands for the size of its first axis.
+        expected = sizes.setdefault(side, size) if isinstance(side, str) else side
+        fits = fits and size == expected
+    if not fits:
         is_array = hasattr(x, "shape") or isinstance(x, numbers.Number | list | tuple)
         raise ValueError(f"{name} must be {_written(wanted)}; got {_written(shape) if is_array else kind_of(x)}")
 
@@ -218,9 +221,12 @@ def short_repr(value: Any) -> str:
     are None."""
     fields = dataclasses.fields(value) if dataclasses.is_dataclass(value) else ()
     left_out = {field.name for field in fields if field.default is None}
-    found = {name: getattr(value, name) for name in getattr(value, "_fields", [field.name for field in fields])}
-    shown = (f"{name}={described(own)}" for name, own in found.items() if own is not None or name not in left_out)
-    return f"{type(value).__name__}({', '.join(shown)})"
+    texts = []
+    for name in getattr(value, "_fields", [field.name for field in fields]):
+        item = getattr(value, name)
+        if item is not None or name not in left_out:
+            texts.append(f"{name}={described(item)}")
+    return f"{type(value).__name__}({', '.join(texts)})"
 
 
 def _written(shape: tuple[int | str, ...]) -> str:

@@ -12,8 +12,10 @@ CELLS = 12
 """Number of cells along each side of a picture, each with its own typical depth."""
 FEWEST = 8
 """Number of Gaussians in a cell that count as much as the whole picture does."""
-FREE, LARGEST = 0.5, 2.5
-"""Octaves at which scores leave 0 (nine of ten Gaussians of a surface have fewer) and reach their largest."""
+FREE = 0.5
+"""Octaves up to which a score is 0; nine of ten Gaussians of a surface have fewer."""
+LARGEST = 2.5
+"""Octaves from which on a score is 255."""
 LEAST_DEPTH = 1e-6
 
 
@@ -22,10 +24,13 @@ def floater_scores(
 ) -> np.ndarray:
     """Return scores [N] as bytes, from 0, on a surface, to 255. Opacities do not matter.
 
-    Three signs are logarithms to base 2, at least 0. In front: the quadratic mean, over the cameras, of the typical
-    depth around a Gaussian in the picture over its own. Alone: the gap to the nearest Gaussians, as an angle seen from
-    the nearest camera, over the scene's median. Seen by few: the median number of cameras over the Gaussian's. The
-    score grows with √(front · (alone + seen by few)): objects are in front of their background, but not alone, and a
+    Three ratios count, as logarithms to base 2, at least 0:
+
+    * front: the typical depth around a Gaussian in the picture, divided by its own; quadratic mean over the cameras
+    * alone: the gap to the nearest Gaussians, an angle from the nearest camera, divided by the scene's median
+    * unseen: the median number of cameras that see a Gaussian, divided by the number that see this one
+
+    The score grows with √(front · (alone + unseen)): objects are in front of their background, but not alone, and a
     sparse background is alone, but not in front.
 
     Args:
@@ -33,24 +38,27 @@ def floater_scores(
       log_scales: [N, 2].
       viewmats, Ks, sizes: [V, 4, 4], [V, 3, 3] and [V, 2] of the cameras; without cameras only gaps count.
     """
-    means, few = np.asarray(means, np.float64), slice(None, None, -(-len(viewmats) // MOST_CAMERAS) or 1)
+    means = np.asarray(means, np.float64)
+    few = slice(None, None, -(-len(viewmats) // MOST_CAMERAS) or 1)
     # A tree does not divide copies at one place, and would compare each with all; nor are they company.
     places, first, place_of = np.unique(means, axis=0, return_index=True, return_inverse=True)
     if len(places) < 2:
         return np.zeros(len(means), np.uint8)
     distances, ids = cKDTree(places).query(places, k=min(NUM_NEIGHBOURS, len(places) - 1) + 1)
-    # A gap ends where the neighbour begins; the own size does not fill it, since floaters are large.
+    # A gap ends where the neighbour begins. The Gaussian itself does not shorten it, because floaters are large.
     reach = np.exp(np.asarray(log_scales, np.float64).mean(axis=1))[first]
     gaps = np.maximum(distances - reach[ids], 0.1 * distances)[:, 1:].mean(axis=1)[place_of.ravel()]
     if not len(viewmats):
         return _bytes_of(_octaves_over_median(gaps))
-    num_views, front = np.zeros(len(means)), np.zeros(len(means))
+    num_views = np.zeros(len(means))
+    front = np.zeros(len(means))
     for viewmat, K, (width, height) in zip(viewmats[few], Ks[few], sizes[few], strict=True):
         x, y, depth = viewmat[:3, :3] @ means.T + viewmat[:3, 3:]
-        before = np.flatnonzero(depth > LEAST_DEPTH)
-        column, row, _ = K @ np.stack([x[before], y[before], depth[before]]) / depth[before]
+        ahead = np.flatnonzero(depth > LEAST_DEPTH)
+        column, row, _ = K @ np.stack([x[ahead], y[ahead], depth[ahead]]) / depth[ahead]
         is_seen = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        seen, octaves = before[is_seen], np.log2(depth[before[is_seen]])
+        seen = ahead[is_seen]
+        octaves = np.log2(depth[seen])
         cell = (column[is_seen] / width * CELLS).astype(int) + CELLS * (row[is_seen] / height * CELLS).astype(int)
         # A cell of few is mostly floaters.
         picture = FEWEST * octaves.mean() if len(octaves) else 0.0

@@ -125,25 +125,27 @@ def check_gaussians(gaussians: Gaussians, name: str = "gaussians") -> None:
     """Raise ValueError, naming the field, unless all fields have their shapes and one dtype, float32 or float64."""
     if not isinstance(gaussians, Gaussians):
         raise ValueError(f"{name} must be Gaussians; got {type(gaussians).__name__}")
-    for own in dataclasses.fields(gaussians):
-        check_array(f"{name}.{own.name}", getattr(gaussians, own.name))
+    names = [field.name for field in dataclasses.fields(gaussians)]
+    for field in names:
+        check_array(f"{name}.{field}", getattr(gaussians, field))
     check_floats(f"{name}.means", gaussians.means, ("N", 3))
     num = gaussians.num
     check_floats(f"{name}.sh", gaussians.sh, (num, "K", 3))
-    if (bases := gaussians.sh.shape[1]) not in NUM_BASES:
+    bases = gaussians.sh.shape[1]
+    if bases not in NUM_BASES:
         raise ValueError(f"{name}.sh must be [{num}, K, 3] with K = 1, 4, 9 or 16, for degrees 0 to 3; got K = {bases}")
     shapes = {"quats": (num, 4), "log_scales": (num, 2), "logit_opacities": (num,), "sh": (num, bases, 3)}
     for field, shape in shapes.items():
         value = getattr(gaussians, field)
         check_floats(f"{name}.{field}", value, shape)
-    dtypes = {field.name: str(dtype_of(getattr(gaussians, field.name))) for field in dataclasses.fields(gaussians)}
-    # The odd ones out are named, whichever field comes first.
+    dtypes = {field: str(dtype_of(getattr(gaussians, field))) for field in names}
+    # The error names the field that differs from most, whichever comes first.
     usual = max(dtypes.values(), key=[*dtypes.values()].count)
     if usual not in FLOATS:
         raise ValueError(f"{name} must be {' or '.join(FLOATS)}; got {usual}")
     for field, dtype in dtypes.items():
         if dtype != usual:
-            others = ", ".join(other for other, own in dtypes.items() if own == usual)
+            others = ", ".join(other for other in names if dtypes[other] == usual)
             raise ValueError(f"{name}.{field} must be {usual} as {others} are; got {dtype}")
 
 
@@ -207,13 +209,16 @@ def init_from_points(
     check_int("num", 2 if num is None else num, 2)
     check_int("sh_degree", sh_degree, 0, len(NUM_BASES) - 1)
     check_number("opacity", opacity, above=0, below=1)
-    points, colors = plain_array("points", points), plain_array("colors", colors)
-    found = np.asarray(colors)
-    if hasattr(colors, "dtype") and not np.issubdtype(found.dtype, np.floating):
-        raise ValueError(f"colors must be floats in [0, 1]; got {found.dtype}: divide bytes by 255")
-    if (outside := found[(found < -COLOR_SLACK) | (found > 1 + COLOR_SLACK)]).size:  # NaN is refused below.
+    points = plain_array("points", points)
+    colors = plain_array("colors", colors)
+    values = np.asarray(colors)
+    if hasattr(colors, "dtype") and not np.issubdtype(values.dtype, np.floating):
+        raise ValueError(f"colors must be floats in [0, 1]; got {values.dtype}: divide bytes by 255")
+    outside = values[(values < -COLOR_SLACK) | (values > 1 + COLOR_SLACK)]
+    if outside.size:  # NaN is refused below.
         raise ValueError(f"colors must be in [0, 1]; got {outside.flat[0]:g}: divide bytes by 255")
-    points, colors = np.asarray(points, np.float64), np.asarray(colors, np.float64)
+    points = np.asarray(points, np.float64)
+    colors = np.asarray(colors, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or points.shape != colors.shape:
         raise ValueError(f"points and colors must both be [P, 3]; got {points.shape} and {colors.shape}")
     if not (np.isfinite(points).all() and np.isfinite(colors).all()):
@@ -221,7 +226,8 @@ def init_from_points(
     rng = np.random.default_rng(seed)
     if num is not None and num < len(points):
         keep = np.sort(rng.choice(len(points), num, replace=False))
-        points, colors = points[keep], colors[keep]
+        points = points[keep]
+        colors = colors[keep]
     if len(points) < 2:
         raise ValueError(f"at least two points are needed to choose scales; got {len(points)}")
     neighbours = min(3, len(points) - 1)
@@ -319,7 +325,7 @@ def stacked_integral(opacities: Array, num_shares: Array) -> Array:
         # Without jit, JAX hands Python's integers to the body of a loop.
         return total + integrand(jnp.asarray(node, opacities.dtype) * spacing)
 
-    # A loop over nodes, not an axis of nodes: the memory stays one value per row.
-    # The integrand is even: half of the line, where the node at 0 counts half, is doubled.
+    # A loop over nodes, not an axis of nodes, so that memory stays one value per row. The integrand is even: half of
+    # the line, where the node at 0 counts half, is doubled.
     half = jax.lax.fori_loop(1, QUADRATURE_STEPS + 1, add_node, 0.5 * integrand(0.0))
     return half * (2 * spacing / math.sqrt(math.pi))

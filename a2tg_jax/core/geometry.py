@@ -30,7 +30,9 @@ Floats = Array | np.ndarray
 def fibonacci(num: int, turn: float = 0.0) -> np.ndarray:
     """Return unit vectors [num, 3] spread evenly over the sphere, a Fibonacci lattice, turned by radians about z."""
     index = np.arange(num) + 0.5
-    z, angle = 1 - 2 * index / num, np.pi * (1 + 5**0.5) * index + turn  # 2π times the golden ratio
+    z = 1 - 2 * index / num
+    # π·(1 + √5) is 2π times the golden ratio.
+    angle = np.pi * (1 + 5**0.5) * index + turn
     across = np.sqrt(1 - z * z)
     return np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)
 
@@ -48,7 +50,8 @@ def homographies(gaussians: Gaussians, camera: Camera) -> tuple[Array, Array]:
     # Number by number: CPUs vectorise over N, but not over axes of 2 and 3.
     x_axis, y_axis, normal = rotation_columns(tuple(gaussians.quats[:, k] for k in range(4)))
     mean = tuple(gaussians.means[:, k] for k in range(3))
-    scale_x, scale_y = gaussians.scales[:, 0], gaussians.scales[:, 1]
+    scale_x = gaussians.scales[:, 0]
+    scale_y = gaussians.scales[:, 1]
     to_pixels = camera.K @ camera.viewmat[:3]
 
     # Row i of equation (1): the axes are directions, only the mean is translated.
@@ -94,7 +97,7 @@ def screen_bounds(M: Array, cutoff: Array, near_plane: float) -> ScreenBounds:
     The cutoff [N] is r² = 2·ln(255·o·max T_A); a splat with r² <= 0 is invisible. Hits have depths from `near_plane`
     on.
     """
-    # The box is found for both cases, since one branch for all splats would have to be the slow one.
+    # Both boxes are computed for all splats: a branch would be the slow one as soon as one splat needs it.
     rows = tuple(tuple(M[:, i, k] for k in range(3)) for i in range(3))
     bounds = unclipped_bounds(rows, cutoff, near_plane)
     clipped = clipped_box(rows, bounds.outline, cutoff, near_plane)
@@ -113,9 +116,12 @@ def unclipped_bounds(M: Sequence[Sequence[Array]], cutoff: Array, near_plane: fl
     # Stand-ins for invisible splats, whose division might give infinities or NaN.
     depth = jnp.where(is_visible, depth, 1.0)
     r2 = jnp.where(is_visible, cutoff, 0.0)
-    mean_x, mean_y = M[0][2] / depth, M[1][2] / depth
-    x_u, x_v = M[0][0] - mean_x * last_u, M[0][1] - mean_x * last_v
-    y_u, y_v = M[1][0] - mean_y * last_u, M[1][1] - mean_y * last_v
+    mean_x = M[0][2] / depth
+    mean_y = M[1][2] / depth
+    x_u = M[0][0] - mean_x * last_u
+    x_v = M[0][1] - mean_x * last_v
+    y_u = M[1][0] - mean_y * last_u
+    y_v = M[1][1] - mean_y * last_v
     spread2 = r2 * (last_u * last_u + last_v * last_v)
     # The least depth on the disc is the mean's minus r·|(M₂₀, M₂₁)|.
     is_clipped = is_visible & (depth - jnp.sqrt(spread2) < near_plane)
@@ -123,13 +129,17 @@ def unclipped_bounds(M: Sequence[Sequence[Array]], cutoff: Array, near_plane: fl
     # The dual conic of the disc is C = M·diag(r², r², −1)·Mᵀ. After division by C₃₃ = spread2 − depth², its last column
     # is the centre e, relative to the projected mean, and S = e·eᵀ minus its upper block.
     scale = jnp.where(is_clipped, 0.0, r2 / jnp.where(is_clipped, 1.0, depth * depth - spread2))
-    shift_x, shift_y = -scale * (x_u * last_u + x_v * last_v), -scale * (y_u * last_u + y_v * last_v)
-    ellipse_x, ellipse_y = mean_x + shift_x, mean_y + shift_y
+    shift_x = -scale * (x_u * last_u + x_v * last_v)
+    shift_y = -scale * (y_u * last_u + y_v * last_v)
+    ellipse_x = mean_x + shift_x
+    ellipse_y = mean_y + shift_y
     xx = (shift_x * shift_x + scale * (x_u * x_u + x_v * x_v)) * (1 + 1e-4) + BOUND_SLACK
     xy = (shift_x * shift_y + scale * (x_u * y_u + x_v * y_v)) * (1 + 1e-4)
     yy = (shift_y * shift_y + scale * (y_u * y_u + y_v * y_v)) * (1 + 1e-4) + BOUND_SLACK
     # The low-pass filter, ρ = 2·|x − c|², reaches r/√2 pixels.
-    half_x, half_y, radius = jnp.sqrt(xx), jnp.sqrt(yy), jnp.sqrt(r2 / 2 + BOUND_SLACK)
+    half_x = jnp.sqrt(xx)
+    half_y = jnp.sqrt(yy)
+    radius = jnp.sqrt(r2 / 2 + BOUND_SLACK)
     return ScreenBounds(
         left=jnp.where(is_visible, jnp.minimum(ellipse_x - half_x, mean_x - radius), 1.0),
         top=jnp.where(is_visible, jnp.minimum(ellipse_y - half_y, mean_y - radius), 1.0),
@@ -147,17 +157,21 @@ def clipped_box(M: Sequence[Sequence[Array]], outline: Outline, cutoff: Array, n
     # A regular polygon whose sides touch the disc contains it; its corners are at r / cos(π/n).
     points = []
     for cosine, sine in zip(np.cos(angles).tolist(), np.sin(angles).tolist(), strict=True):
-        u, v = reach * cosine, reach * sine
+        u = reach * cosine
+        v = reach * sine
         points.append(tuple(row[0] * u + row[1] * v + row[2] for row in M))
 
-    mean_x, mean_y, radius = outline.mean_x, outline.mean_y, outline.radius
+    mean_x = outline.mean_x
+    mean_y = outline.mean_y
+    radius = outline.radius
     box = mean_x, mean_y, mean_x, mean_y
 
     def joined(box: Box, is_valid: Array, point: Sequence[Array]) -> Box:
         x, y, depth = point
         # A point that is not valid adds the mean, where the box begins.
         depth = jnp.where(is_valid, jnp.maximum(depth, near_plane), 1.0)
-        x, y = jnp.where(is_valid, x / depth, mean_x), jnp.where(is_valid, y / depth, mean_y)
+        x = jnp.where(is_valid, x / depth, mean_x)
+        y = jnp.where(is_valid, y / depth, mean_y)
         return jnp.minimum(box[0], x), jnp.minimum(box[1], y), jnp.maximum(box[2], x), jnp.maximum(box[3], y)
 
     # As Sutherland and Hodgman clip polygons: corners before the plane count, and edges where they cross it.
@@ -169,7 +183,8 @@ def clipped_box(M: Sequence[Sequence[Array]], outline: Outline, cutoff: Array, n
         cut = tuple(a + fraction * (b - a) for a, b in zip(point, following, strict=True))
         box = joined(box, crosses, cut)
     left, top, right, bottom = box
-    margin_x, margin_y = 1e-3 * (right - left) + BOUND_SLACK, 1e-3 * (bottom - top) + BOUND_SLACK
+    margin_x = 1e-3 * (right - left) + BOUND_SLACK
+    margin_y = 1e-3 * (bottom - top) + BOUND_SLACK
     return (
         jnp.minimum(left - margin_x, mean_x - radius),
         jnp.minimum(top - margin_y, mean_y - radius),

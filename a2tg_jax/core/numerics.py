@@ -29,15 +29,15 @@ def evenly_chosen(items: Any, most: int) -> Any:
     return items[chosen] if isinstance(items, np.ndarray | Array) else [items[index] for index in chosen]
 
 
-def relative_difference(found: Sequence[ArrayLike], wanted: Sequence[ArrayLike]) -> float:
+def relative_difference(results: Sequence[ArrayLike], references: Sequence[ArrayLike]) -> float:
     """Return the largest |a − b| / |b| of pairs of arrays, Euclidean norms over a whole array; NaN if one is (host)."""
-    pairs = [(np.asarray(a, np.float64), np.asarray(b, np.float64)) for a, b in zip(found, wanted, strict=True)]
-    # max of Python would drop NaN.
+    pairs = [(np.asarray(a, np.float64), np.asarray(b, np.float64)) for a, b in zip(results, references, strict=True)]
+    # Python's max would drop NaN.
     return float(np.max([np.linalg.norm(a - b) / np.linalg.norm(b) for a, b in pairs if b.size]))
 
 
 def factor_to(most: float, columns: Sequence[Array]) -> Array:
-    """Return the factor [N] by which the largest magnitude of a row of columns [N] becomes `most`, or 1 if it is less.
+    """Return the factor [N] by which the largest magnitude of a row of columns [N] becomes `most`; 1 if it is smaller.
     It has no gradient."""
     largest = functools.reduce(jnp.maximum, (jnp.abs(jax.lax.stop_gradient(column)) for column in columns))
     return jnp.where(largest > most, most / largest, 1.0)

@@ -94,10 +94,11 @@ def adam_update(
         check_number(name, decay, least=0, below=1)
     check_number("eps", eps, least=0)
     _check_floats(params)
+    expected = str(jax.tree.structure(params))
     for name, tree in (("grads", grads), ("state.mu", state.mu), ("state.nu", state.nu)):
-        found, wanted = str(jax.tree.structure(tree)), str(jax.tree.structure(params))
-        if found != wanted:
-            raise ValueError(f"{name} must have the structure of params, {wanted}; got {found}")
+        structure = str(jax.tree.structure(tree))
+        if structure != expected:
+            raise ValueError(f"{name} must have the structure of params, {expected}; got {structure}")
         leaves = jax.tree_util.tree_leaves_with_path(tree)
         for (path, leaf), param in zip(leaves, jax.tree.leaves(params), strict=True):
             check_shape(f"{name}{jax.tree_util.keystr(path)}", leaf, jnp.shape(param))
@@ -105,8 +106,8 @@ def adam_update(
     mu = jax.tree.map(lambda m, g: b1 * m + (1 - b1) * g, state.mu, grads)
     nu = jax.tree.map(lambda v, g: b2 * v + (1 - b2) * g * g, state.nu, grads)
 
-    # For each dtype once. In this order, so that the same program is compiled each time. `result_type`: without x64,
-    # JAX computes in float32 with float64 of NumPy.
+    # Once for each dtype, in the order of the leaves, so that the same program is compiled each time. `result_type`,
+    # because without x64 JAX computes float64 of NumPy in float32.
     dtypes = dict.fromkeys(map(jnp.result_type, jax.tree.leaves(params)))
     corrections = {dtype: [_bias_correction(decay, count, dtype) for decay in (b1, b2)] for dtype in dtypes}
 
@@ -119,7 +120,7 @@ def adam_update(
         change: Array = rate / first * (m / (root + eps))
         return param - change
 
-    params = jax.tree.map(step, _one_each(rates, params), params, mu, nu)
+    params = jax.tree.map(step, _rate_of_each(rates, params), params, mu, nu)
     return OptStep(params=params, state=AdamState(mu, nu, count))
 
 
@@ -146,22 +147,21 @@ def exponential_decay(start: float, final_factor: float, iteration: Array | int,
     return start * jnp.exp(math.log(final_factor) * progress)
 
 
-def _one_each(rates: object, params: object) -> object:
+def _rate_of_each(rates: object, params: object) -> object:
     """Return a rate for each leaf of the parameters. Raise ValueError, naming the leaf, if a rate does not fit."""
     try:
-        found = jax.tree.broadcast(rates, params)
+        rates = jax.tree.broadcast(rates, params)
     except ValueError as error:
-        found_fields = shortened(str(jax.tree.structure(rates)))
-        raise ValueError(f"rates must be one for all, or have the fields of params; got {found_fields}") from error
-    for (path, param), rate in zip(jax.tree_util.tree_leaves_with_path(params), jax.tree.leaves(found), strict=True):
+        structure = shortened(str(jax.tree.structure(rates)))
+        raise ValueError(f"rates must be one for all, or have the fields of params; got {structure}") from error
+    for (path, param), rate in zip(jax.tree_util.tree_leaves_with_path(params), jax.tree.leaves(rates), strict=True):
         shape = jnp.shape(rate)
-        fits = len(shape) == param.ndim and all(
-            own in (1, whole) for own, whole in zip(shape, param.shape, strict=True)
-        )
+        fits = len(shape) == param.ndim
+        fits = fits and all(side in (1, whole) for side, whole in zip(shape, param.shape, strict=True))
         if shape and not fits:
             name = f"rates{jax.tree_util.keystr(path)}"
             raise ValueError(f"{name} must broadcast to {[*param.shape]} at equal rank; got {[*shape]}")
-    return found
+    return rates
 
 
 def _check_floats(params: object) -> None:

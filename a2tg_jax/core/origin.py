@@ -20,7 +20,7 @@ BLACK: Color = (0.0, 0.0, 0.0)
 WHITE: Color = (1.0, 1.0, 1.0)
 
 
-# eq=False: the generated == would ask arrays for one truth value, which raises.
+# eq=False: the generated == compares arrays, whose truth value is ambiguous.
 @dataclasses.dataclass(frozen=True, eq=False)
 class Origin(NamedFields):
     """V cameras and their world, on the host. Two origins are equal if all their numbers are."""
@@ -82,7 +82,8 @@ class Origin(NamedFields):
     def training_cameras(self) -> list[Camera]:
         """Cameras of photographs that were trained on; all cameras if all were held out."""
         trains_on_all = bool(self.is_test.all())
-        return [own for own, is_test in zip(self.cameras, self.is_test, strict=True) if trains_on_all or not is_test]
+        cameras = zip(self.cameras, self.is_test, strict=True)
+        return [camera for camera, is_test in cameras if trains_on_all or not is_test]
 
     @property
     def held_out_cameras(self) -> list[Camera]:
@@ -90,7 +91,7 @@ class Origin(NamedFields):
         cameras."""
         if self.is_test.all():
             return []
-        return [own for own, is_test in zip(self.cameras, self.is_test, strict=True) if is_test]
+        return [camera for camera, is_test in zip(self.cameras, self.is_test, strict=True) if is_test]
 
     def moved(self, similarity: Similarity) -> "Origin":
         """Return the same cameras in the world that `similarity` leads to, without the corrections they contain."""
@@ -103,8 +104,9 @@ class Origin(NamedFields):
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Origin):
             return NotImplemented
-        (own, structure), (others, other_structure) = (jax.tree.flatten(dataclasses.asdict(x)) for x in (self, other))
-        return structure == other_structure and all(map(np.array_equal, own, others))  # type: ignore[operator]
+        leaves, structure = jax.tree.flatten(dataclasses.asdict(self))
+        other_leaves, other_structure = jax.tree.flatten(dataclasses.asdict(other))
+        return structure == other_structure and all(map(np.array_equal, leaves, other_leaves))  # type: ignore[operator]
 
     def __repr__(self) -> str:
         return f"Origin({len(self.names)} cameras, {int(np.sum(self.is_test))} of them for testing)"

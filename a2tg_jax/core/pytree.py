@@ -102,7 +102,7 @@ def pytree(cls: Any = None, /, **options: Any) -> Any:
       The class.
     """
     if cls is None:
-        return lambda own: pytree(own, **options)
+        return lambda decorated: pytree(decorated, **options)
     own_equality = vars(cls).get("__eq__", _are_equal)
     made = dataclasses.dataclass(frozen=True, **options)(cls)
     made.__eq__ = own_equality
@@ -111,16 +111,17 @@ def pytree(cls: Any = None, /, **options: Any) -> Any:
     for field in dataclasses.fields(made):
         kind = next((kind for kind in ("static", "beside") if field.metadata.get(kind)), "dynamic")
         kinds[kind].append(field.name)
-    dynamic, fixed = tuple(kinds["dynamic"]), tuple(kinds["static"])
+    dynamic = tuple(kinds["dynamic"])
+    fixed = tuple(kinds["static"])
     # For errors, which name a leaf by its path, such as params.gaussians.means.
     keys = tuple(jax.tree_util.GetAttrKey(name) for name in dynamic)
     common = {field.name for field in dataclasses.fields(made) if field.metadata.get("shared")}
     left_out = {field.name: field.default for field in dataclasses.fields(made) if field.name in kinds["beside"]}
 
     def flatten(node: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        own = node.__dict__
-        children = (Shared(own[name]) if name in common else own[name] for name in dynamic)
-        return tuple(children), tuple(own[name] for name in fixed)
+        values = node.__dict__
+        children = tuple(Shared(values[name]) if name in common else values[name] for name in dynamic)
+        return children, tuple(values[name] for name in fixed)
 
     def flatten_with_keys(node: object) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         children, values = flatten(node)
@@ -143,35 +144,36 @@ def pytree(cls: Any = None, /, **options: Any) -> Any:
     return made
 
 
-def _are_equal(one: Any, other: Any) -> Any:
+def _are_equal(self: Any, other: Any) -> Any:
     """Compare two instances field by field, as dataclasses do, but arrays as a whole."""
-    if type(other) is not type(one):
+    if type(other) is not type(self):
         return NotImplemented
-    names = [field.name for field in dataclasses.fields(one)]
-    own = [getattr(one, name) for name in names]
+    names = [field.name for field in dataclasses.fields(self)]
+    values = [getattr(self, name) for name in names]
     others = [getattr(other, name) for name in names]
-    structure: Any = jax.tree.structure(own)
+    structure: Any = jax.tree.structure(values)
     if structure != jax.tree.structure(others):
         return False
-    return all(map(_are_equal_leaves, jax.tree.leaves(own), jax.tree.leaves(others)))
+    return all(map(_are_equal_leaves, jax.tree.leaves(values), jax.tree.leaves(others)))
 
 
-def _are_equal_leaves(one: object, other: object) -> bool:
-    if isinstance(one, np.ndarray | jax.Array) or isinstance(other, np.ndarray | jax.Array):
-        # Outside of `array_equal`, which takes two tracers for unequal without a word.
-        return one is other or np.array_equal(np.asarray(one), np.asarray(other))
-    return one is other or bool(one == other)
+def _are_equal_leaves(a: object, b: object) -> bool:
+    if isinstance(a, np.ndarray | jax.Array) or isinstance(b, np.ndarray | jax.Array):
+        # `asarray` raises for tracers; `array_equal` would catch the error and call them unequal.
+        return a is b or np.array_equal(np.asarray(a), np.asarray(b))
+    return a is b or bool(a == b)
 
 
 def check_pytree(name: str, value: object) -> None:
     """Raise ValueError unless `pytree` decorates the class of a value and of each dataclass in it."""
-    ahead: list[Any] = [jax.tree.structure(value)]
+    nodes: list[Any] = [jax.tree.structure(value)]
     kinds = {type(leaf) for leaf in jax.tree.leaves(value) if leaf is value or dataclasses.is_dataclass(leaf)}
-    while ahead:
-        node = ahead.pop()
-        if data := node.node_data():
+    while nodes:
+        node = nodes.pop()
+        data = node.node_data()
+        if data:
             kinds.add(data[0])
-            ahead += node.children()
+            nodes += node.children()
     for kind in kinds:
         is_other = dataclasses.is_dataclass(kind) or (kind is type(value) and not issubclass(kind, tuple | list | dict))
         # `__dict__`, not getattr: an undecorated subclass inherits the mark of its base.
@@ -184,8 +186,8 @@ def num_compiled(jitted: Any) -> int:
     return int(jitted._cache_size())  # JAX has no public counterpart
 
 
-# Floats of a pytree, which training differentiates and changes, apart from the rest: `jax.grad` rejects integers, such
-# as the places of textures.
+# Training differentiates and changes the floats of a pytree. `partition` separates them from the rest, integers such as
+# the places of textures, which `jax.grad` rejects.
 #
 #     floats, rest = partition(model)
 #     gradient = jax.grad(lambda floats: loss(combine(floats, rest)))(floats)
@@ -221,5 +223,5 @@ def combine(floats: T, rest: T) -> T:
       A pytree of the same structure, with every leaf.
     """
     return jax.tree.map(
-        lambda one, other: other if one is None else one, floats, rest, is_leaf=lambda leaf: leaf is None
+        lambda number, other: other if number is None else number, floats, rest, is_leaf=lambda leaf: leaf is None
     )

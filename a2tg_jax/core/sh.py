@@ -18,12 +18,16 @@ NUM_BASES = (1, 4, 9, 16)
 def sh_basis(directions: Array, num: int = 16) -> Array:
     """Return the first basis functions [..., num] at unit directions [..., 3]; `num` is one of `NUM_BASES`."""
     # Factors and signs of 3DGS's program, whose files hold coefficients of this basis.
-    x, y, z = directions[..., 0], directions[..., 1], directions[..., 2]
+    x = directions[..., 0]
+    y = directions[..., 1]
+    z = directions[..., 2]
     bases = [jnp.full_like(x, 0.28209479177387814)]
     if num > 1:
         bases += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
     if num > 4:
-        xx, yy, zz = x * x, y * y, z * z
+        xx = x * x
+        yy = y * y
+        zz = z * z
         bases += [
             1.0925484305920792 * x * y,
             -1.0925484305920792 * y * z,
@@ -47,7 +51,7 @@ def sh_basis(directions: Array, num: int = 16) -> Array:
 def directions_from(center: Array, means: Array) -> Array:
     """Return the unit vectors [N, 3] from a camera's centre [3] to means [N, 3] at any distance."""
     offsets = means - center[None, :]
-    # Otherwise squares would overflow far away, and gradients be NaN.
+    # Far away, squares would overflow and gradients be NaN.
     return normalize(offsets * factor_to(LARGEST_NUMBER, [*offsets.T])[:, None])
 
 

@@ -68,7 +68,9 @@ def check_similarity(similarity: Similarity, what: str) -> None:
     check_array(f"{what}.rotation", similarity.rotation, "use np.asarray")
     check_shape(f"{what}.rotation", similarity.rotation, (3, 3))
     check_shape(f"{what}.translation", similarity.translation, (3,))
-    scale, rotation, translation = similarity.scale, similarity.rotation, similarity.translation
+    scale = similarity.scale
+    rotation = similarity.rotation
+    translation = similarity.translation
     if not (1 / LARGEST_NUMBER <= scale <= LARGEST_NUMBER and (np.abs(translation) <= LARGEST_NUMBER).all()):
         raise ValueError(
             f"{what} must have a positive scale and a finite translation, up to {LARGEST_NUMBER:g}, the scale from "
@@ -134,7 +136,8 @@ def sh_rotation(rotation: np.ndarray) -> np.ndarray:
     """
     directions = fibonacci(NUM_DIRECTIONS)
     # The fit is exact: rotations keep degrees apart, and 64 directions determine 7 functions.
-    before, after = _basis(directions), _basis(directions @ rotation.T)
+    before = _basis(directions)
+    after = _basis(directions @ rotation.T)
     matrix = np.zeros((16, 16))
     for degree in SH_DEGREES:
         matrix[degree, degree] = np.linalg.lstsq(after[:, degree], before[:, degree], rcond=None)[0]

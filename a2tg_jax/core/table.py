@@ -7,7 +7,6 @@ only a change of these, on the host, compiles a step again.
 """
 
 import dataclasses
-import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, ClassVar, NamedTuple, Self, TypeVar
@@ -27,7 +26,7 @@ Size = tuple[int, ...]
 Group = tuple[np.ndarray, np.ndarray]
 """Indices [n] of Gaussians, and their blocks [n, T₁, …, C], all of one size."""
 KNOWN_SLACK = 1.25
-"""Largest number of elements of a known shape, as a multiple of a new one's, for which it is taken."""
+"""Largest ratio of the elements of a known shape to those of the smallest shape, at which the known one is reused."""
 
 
 class Shape(NamedTuple):
@@ -109,29 +108,34 @@ class Table(NamedFields):
         places, capacities = plan_places(sizes)
         dtype = np.result_type(*(blocks for _, blocks in groups)) if groups else np.float32
         shapes = zip(capacities, places.bucket_sizes, strict=True)
-        buckets, rows = [cls._padded(capacity, size, dtype) for capacity, size in shapes], np.asarray(places.row)
+        buckets = [cls._padded(capacity, size, dtype) for capacity, size in shapes]
+        rows = np.asarray(places.row)
         for ids, blocks in groups:
             buckets[int(places.bucket[ids[0]])][rows[ids]] = blocks
         return cls.placed(buckets, places)
 
     def groups(self) -> list[Group]:
         """Return a group for each bucket, its Gaussians ascending (host)."""
-        bucket, row = np.asarray(self.bucket), np.asarray(self.row)
-        ids = [np.flatnonzero(bucket == index) for index in range(len(self.buckets))]
-        return [(own, np.asarray(blocks)[row[own]]) for own, blocks in zip(ids, self.buckets, strict=True)]
+        bucket, row = _indices(self)
+        groups = []
+        for index, blocks in enumerate(self.buckets):
+            ids = np.flatnonzero(bucket == index)
+            groups.append((ids, np.asarray(blocks)[row[ids]]))
+        return groups
 
     def blocks(self) -> list[np.ndarray]:
         """Return the N blocks as NumPy arrays [T₁, …, C], in the order of the Gaussians (host)."""
-        found = {
-            index: block for ids, blocks in self.groups() for index, block in zip(ids.tolist(), blocks, strict=True)
-        }
-        return [found[index] for index in range(self.num)]
+        block_of: dict[int, np.ndarray] = {}
+        for ids, blocks in self.groups():
+            block_of.update(zip(ids.tolist(), blocks, strict=True))
+        return [block_of[index] for index in range(self.num)]
 
     @classmethod
     def of_flat(cls, sizes: np.ndarray, elements: np.ndarray) -> Self:
         """Return the table of sizes [N, D] and of what `flat` returned, which fits them (host)."""
         places, _ = plan_places(sizes)
-        ends, groups = np.cumsum(sizes.prod(axis=1)), []
+        ends = np.cumsum(sizes.prod(axis=1))
+        groups = []
         for index, size in enumerate(places.bucket_sizes):
             ids = np.flatnonzero(np.asarray(places.bucket) == index)
             # A block ends where the running sum of areas does.
@@ -141,7 +145,8 @@ class Table(NamedFields):
 
     def flat(self) -> np.ndarray:
         """Return the elements [M, C] of all blocks, block after block, each row by row (host)."""
-        ends, dtype = np.cumsum(self.sizes.prod(axis=1)), self.buckets[0].dtype if self.buckets else np.float32
+        ends = np.cumsum(self.sizes.prod(axis=1))
+        dtype = self.buckets[0].dtype if self.buckets else np.float32
         elements = np.zeros((ends[-1] if self.num else 0, len(self.padding)), dtype)
         for ids, blocks in self.groups():
             area = math.prod(blocks.shape[1:-1])
@@ -151,9 +156,12 @@ class Table(NamedFields):
     @classmethod
     def joined(cls, tables: Sequence[Self]) -> Self:
         """Return the blocks of several tables, one after the other (host)."""
-        starts = itertools.accumulate((table.num for table in tables), initial=0)
-        own = zip(tables, starts, strict=False)  # the last start is the total
-        return cls.of_groups((ids + start, blocks) for table, start in own for ids, blocks in table.groups())
+        groups: list[Group] = []
+        start = 0
+        for table in tables:
+            groups += [(ids + start, blocks) for ids, blocks in table.groups()]
+            start += table.num
+        return cls.of_groups(groups)
 
     @property
     def num(self) -> int:
@@ -189,7 +197,8 @@ class Table(NamedFields):
         """Return blocks, or moments of them, whose Gaussian i is the former rows[i] of N; traceable. ValueError: there
         are blocks of several sizes."""
         if len(self.buckets) != 1:
-            name, num = type(self).__name__.lower(), len(self.buckets)
+            name = type(self).__name__.lower()
+            num = len(self.buckets)
             raise ValueError(f"{name} of {num} sizes cannot change rows: densify and prune before they grow")
         # With one bucket, row i is Gaussian i's (`plan_places`); padding follows and stays.
         (bucket,) = self.buckets
@@ -211,20 +220,22 @@ class Table(NamedFields):
         """Return the blocks of the Gaussians `rows` [M], which may repeat, in buckets as small as they need (host).
         Padding is `padding` of the class, or C given numbers, such as zeros for moments."""
         places, capacities = plan_places(self.sizes[rows])
-        old, new = ((np.asarray(own.bucket), np.asarray(own.row)) for own in (self, places))
-        ends, padding = ((old[0][rows], old[1][rows]), new), padding or self.padding
+        bucket, row = _indices(self)
+        ends = ((bucket[rows], row[rows]), _indices(places))
+        padding = padding or self.padding
         return self.placed(_moved(type(self), self.buckets, ends, places.bucket_sizes, capacities, padding), places)
 
     def nearest_places(self) -> Self:
         """Return the table with int32 buckets and rows, each moved to the nearest one that exists; traced.
 
-        `check_table` refuses such places where it can read them. Traced ones have no values to check.
+        `check_table` refuses places that do not exist, but cannot check traced ones, which have no values.
         """
 
         def clipped(index: Array, last: Any) -> Array:
-            # Clipped to int32 first, which a negative uint or an int64 beyond it would wrap around in.
-            own, wanted = np.iinfo(index.dtype), np.iinfo(np.int32)
-            index = jnp.clip(index, max(wanted.min, own.min), min(wanted.max, own.max)).astype(jnp.int32)
+            # First to the range of int32: larger integers of other dtypes would wrap around.
+            given = np.iinfo(index.dtype)
+            int32 = np.iinfo(np.int32)
+            index = jnp.clip(index, max(int32.min, given.min), min(int32.max, given.max)).astype(jnp.int32)
             return jnp.clip(index, 0, last)
 
         bucket = clipped(self.bucket, len(self.buckets) - 1)
@@ -277,8 +288,8 @@ def is_held(x: object) -> bool:
 
 # Places
 
-_Ends = tuple[np.ndarray, np.ndarray]
-"""Buckets and rows of blocks that move."""
+_Indices = tuple[np.ndarray, np.ndarray]
+"""Buckets and rows of blocks."""
 
 
 class Places(NamedTuple):
@@ -287,6 +298,10 @@ class Places(NamedTuple):
     bucket: Array
     row: Array
     bucket_sizes: tuple[Size, ...]
+
+
+def _indices(places: Table | Places) -> _Indices:
+    return np.asarray(places.bucket), np.asarray(places.row)
 
 
 def bucket_capacity(count: int) -> int:
@@ -303,12 +318,13 @@ def plan_places(
 ) -> tuple[Places, tuple[int, ...]]:
     """Return the places of blocks of the given sizes [N, D], from 0 to 63, and the capacity of each bucket (host).
 
-    A shape with room for the blocks is taken: `room`, however large it is, or a known one, with a compiled program, of
-    at most `KNOWN_SLACK` times the elements.
+    If `room`, of any size, has space for the blocks, it is used; otherwise the smallest known shape that has, with at
+    most `KNOWN_SLACK` times the elements needed, because its programs are compiled; otherwise the smallest shape.
     """
-    for name, shape in [*(("known", own) for own in known), ("room", room)]:
-        if shape is not None:
-            check_kind(name, shape, Shape)
+    for shape in known:
+        check_kind("known", shape, Shape)
+    if room is not None:
+        check_kind("room", room, Shape)
     # Codes of sizes ascend as the sizes do.
     weights = 64 ** np.arange(sizes.shape[1])[::-1]
     codes, bucket, counts = np.unique(sizes @ weights, return_inverse=True, return_counts=True)
@@ -320,19 +336,20 @@ def plan_places(
     sides = map(tuple, (codes[:, None] // weights % 64).tolist())
     needed: dict[Size, int] = dict(zip(sides, counts.tolist(), strict=True))
     # Without Gaussians, one bucket of no blocks keeps the number of sides and the dtype.
-    new = Shape(tuple(needed), tuple(map(bucket_capacity, needed.values())))
+    smallest = Shape(tuple(needed), tuple(map(bucket_capacity, needed.values())))
 
     def has_room(shape: Shape) -> bool:
-        own = dict(zip(*shape, strict=True))
-        return all(own.get(size, 0) >= count for size, count in needed.items())
+        rows = dict(zip(*shape, strict=True))
+        return all(rows.get(size, 0) >= count for size, count in needed.items())
 
     if not needed:
         shape = Shape(((0,) * sizes.shape[1],), (0,))
     elif room is not None and has_room(room):
         shape = room
     else:
-        fitting = [own for own in known if has_room(own) and own.num_elements <= KNOWN_SLACK * new.num_elements]
-        shape = min(fitting, key=lambda own: own.num_elements, default=new)
+        most = KNOWN_SLACK * smallest.num_elements
+        fitting = [shape for shape in known if has_room(shape) and shape.num_elements <= most]
+        shape = min(fitting, key=lambda shape: shape.num_elements, default=smallest)
     place = np.asarray([shape.sizes.index(size) for size in needed], np.int32)
     buckets = (place[bucket] if len(place) else bucket).astype(np.int32)
     return Places(jax.device_put(buckets), jax.device_put(row), shape.sizes), shape.capacities
@@ -354,32 +371,33 @@ def resize(
     stay. They become 0 for blocks that are not `kept` [N]. `known` and `room` are as for `plan_places`.
     """
     places, capacities = plan_places(sizes, known, room)
-    ends = [(np.asarray(own.bucket), np.asarray(own.row)) for own in (table, places)]
+    ends = [_indices(table), _indices(places)]
+    kept_ends = ends
     if kept is not None:
         check_mask("kept", kept, (table.num,))
-    own, chosen = type(table), slice(None) if kept is None else kept
-    kept_ends = [(bucket[chosen], row[chosen]) for bucket, row in ends]
+        kept_ends = [(bucket[kept], row[kept]) for bucket, row in ends]
+    kind = type(table)
 
-    def rebuilt(old: Table, ends: list[_Ends], padding: Sequence[float]) -> Table:
-        targets = _moved(own, old.buckets, ends, places.bucket_sizes, capacities, padding)
-        whole = own.placed(targets, places)
+    def rebuilt(old: Table, ends: list[_Indices], padding: Sequence[float]) -> Table:
+        targets = _moved(kind, old.buckets, ends, places.bucket_sizes, capacities, padding)
+        whole = kind.placed(targets, places)
         return partition(whole)[0] if old.bucket is None else whole  # Moments are floats only.
 
     def rebuilt_moments(leaf: object) -> Any:
-        if not isinstance(leaf, own):
+        if not isinstance(leaf, kind):
             return leaf
         if len(leaf.buckets) != len(table.buckets) or leaf.bucket_sizes != table.bucket_sizes:
             raise ValueError(f"moments must have the buckets of the table; got {leaf}")
         for index, (moment, blocks) in enumerate(zip(leaf.buckets, table.buckets, strict=True)):
             check_shape(f"moments.buckets[{index}]", moment, blocks.shape)
-        return rebuilt(leaf, kept_ends, (0.0,) * len(own.padding))
+        return rebuilt(leaf, kept_ends, (0.0,) * len(kind.padding))
 
-    moments = jax.tree.map(rebuilt_moments, moments, is_leaf=lambda leaf: isinstance(leaf, own))
-    return rebuilt(table, ends, own.padding), moments
+    moments = jax.tree.map(rebuilt_moments, moments, is_leaf=lambda leaf: isinstance(leaf, kind))
+    return rebuilt(table, ends, kind.padding), moments
 
 
 def _moved(
-    kind: type[Table], buckets: Sequence[Any], ends: Sequence[_Ends], sizes: Sequence[Size],
+    kind: type[Table], buckets: Sequence[Any], ends: Sequence[_Indices], sizes: Sequence[Size],
     capacities: Sequence[int], padding: Sequence[float],
 ) -> list[np.ndarray]:  # fmt: skip
     """Return new buckets of given sizes and capacities, with blocks moved from old to new (bucket, row)."""
@@ -393,8 +411,8 @@ def _moved(
             continue
         source = np.asarray(bucket)  # Each old bucket is read once, one after the other.
         for target in np.unique(new_bucket[from_here]).tolist():
-            own = from_here[new_bucket[from_here] == target]
-            targets[target][new_row[own]] = kind.resized(source[old_row[own]], sizes[target])
+            ids = from_here[new_bucket[from_here] == target]
+            targets[target][new_row[ids]] = kind.resized(source[old_row[ids]], sizes[target])
     return targets
 
 
@@ -425,10 +443,12 @@ def check_table(table: Table, num: int | None = None, name: str = "textures") ->
         raise ValueError(f"{name} must have a row for each of {table.num} Gaussians; all buckets are empty")
     if not table.num or any(isinstance(leaf, jax.core.Tracer) for leaf in (table.bucket, table.row)):
         return
-    places, last = np.asarray(table.bucket), len(table.buckets) - 1
+    places = np.asarray(table.bucket)
+    last = len(table.buckets) - 1
     if places.min() < 0 or places.max() > last:
         raise ValueError(f"{name}.bucket must be 0 to {last}; got {places.min()} to {places.max()}")
-    rows, capacities = np.asarray(table.row), np.asarray([len(blocks) for blocks in table.buckets])[places]
+    rows = np.asarray(table.row)
+    capacities = np.asarray([len(blocks) for blocks in table.buckets])[places]
     outside = np.flatnonzero((rows < 0) | (rows >= capacities))
     if outside.size:
         first = outside[0]
@@ -440,7 +460,7 @@ def check_table(table: Table, num: int | None = None, name: str = "textures") ->
 
 def check_places(table: Table, name: str = "textures") -> None:
     """Raise ValueError unless each block has its own row; the table must have passed `check_table` (host)."""
-    bucket, row = np.asarray(table.bucket), np.asarray(table.row)
+    bucket, row = _indices(table)
     capacities = np.asarray([len(blocks) for blocks in table.buckets], np.int64)
     # With the rows of all buckets numbered through, equal numbers are shared rows.
     starts = np.cumsum(capacities) - capacities

@@ -61,8 +61,8 @@ class CloneSplitPrune(StepEvent):
     """
 
     cap: int = static(default=500_000)
-    """Largest number of Gaussians and of allocated rows; a memory_budget replaces it. Beyond it the largest
-    gradients have priority, and the others are counted."""
+    """Largest number of Gaussians and of allocated rows; a memory_budget replaces it. If there is no room for all
+    copies, the largest gradients come first, and the others are counted."""
     threshold: float = 2e-4
     """Smallest average gradient that is densified, by the position on the screen in units of half an image. With a
     memory_budget the largest gradients are densified, however small."""
@@ -111,7 +111,8 @@ class CloneSplitPrune(StepEvent):
         """Return a mask [N] of rows that are too faint or too large."""
         opacities = model.appearance.opacities(model.gaussians)
         between = reset_interval(now.num_iterations)
-        is_late, since_reset = now.iteration > between, now.iteration % between
+        is_late = now.iteration > between
+        since_reset = now.iteration % between
         is_faint = (opacities < self.least_opacity) & ~(is_late & (since_reset < RECOVERY))
         return is_faint | (is_late & (jnp.max(model.gaussians.scales, axis=1) > self.largest_share * now.scene_scale))
 
@@ -144,7 +145,7 @@ class FillingDensity(CloneSplitPrune):
         reached = jnp.minimum(reached, 2 * num_live)
         is_kept = is_there & ~self._is_pruned(now, model)
         opacities = model.appearance.opacities(model.gaussians)
-        # Those that would stay anyway come first.
+        # Rows that are kept anyway come first.
         place = _ranks(jnp.where(is_kept, jnp.inf, opacities), is_there)
         # Half of the number to reach, since each of these can be doubled.
         is_kept = is_kept | (is_there & jnp.any(is_kept) & (place < (reached + 1) // 2))
@@ -173,7 +174,8 @@ def apply_plan(key: Array, plan: CloneSplitPlan, model: Model, moments: AdamStat
     num = model.gaussians.num
     index = jnp.arange(num, dtype=jnp.int32)
     is_doubled = plan.is_cloned | plan.is_split
-    num_kept, num_copies = (jnp.sum(mask, dtype=jnp.int32) for mask in (plan.is_kept, is_doubled))
+    num_kept = jnp.sum(plan.is_kept, dtype=jnp.int32)
+    num_copies = jnp.sum(is_doubled, dtype=jnp.int32)
     # Sorting masks stably puts marked rows first, in their order, at fixed shapes.
     kept_first = jnp.argsort(~plan.is_kept, stable=True).astype(jnp.int32)
     doubled_first = jnp.argsort(~is_doubled, stable=True).astype(jnp.int32)
@@ -226,13 +228,14 @@ class OpacityReset(StepEvent):
     def apply(self, now: Now, model: Model, moments: AdamState, state: tuple[()]) -> Change:
         gaussians, appearance = model.appearance.limit_opacities(model.gaussians, jnp.asarray(self.most))
         limited = dataclasses.replace(model, gaussians=gaussians, appearance=appearance)
-        (before, _), (after, _) = partition(model), partition(limited)
+        old_floats, _ = partition(model)
+        new_floats, _ = partition(limited)
+
+        def cleared(moment: Array, old: Array, new: Array) -> Array:
+            # `is`: `limit_opacities` returns the same array where it changes nothing.
+            return moment if new is old else jnp.zeros_like(moment)
 
         # Moments belong to the values before the reset.
-        mu, nu = (
-            # `is`: `limit_opacities` returns the same array where it changes nothing.
-            jax.tree.map(lambda x, old, new: x if new is old else jnp.zeros_like(x), moment, before, after)
-            for moment in (moments.mu, moments.nu)
-        )
-        moments = dataclasses.replace(moments, mu=mu, nu=nu)
-        return Change(limited, moments, state)
+        mu = jax.tree.map(cleared, moments.mu, old_floats, new_floats)
+        nu = jax.tree.map(cleared, moments.nu, old_floats, new_floats)
+        return Change(limited, dataclasses.replace(moments, mu=mu, nu=nu), state)

@@ -38,7 +38,7 @@ MOST_VIEWS = 48
 OPACITY = 0.3
 """Opacity of new Gaussians."""
 LEAST_ALPHA = 0.5
-"""Alpha of a pixel from which on it can get a Gaussian; where less is drawn, the depth is of no surface."""
+"""Least alpha of a pixel that can get a Gaussian; with less, its depth is not of a surface."""
 
 
 @pytree
@@ -75,14 +75,15 @@ class PlaceByError(HostEvent):
         if any(map(is_table, jax.tree.leaves(model.appearance, is_leaf=is_table))):
             raise ValueError("share must be 0 in a stage whose Gaussians have textures or differ in degree")
         num = model.num
-        wanted, room = round(num * float(self.share)), min(self.cap, model.gaussians.num) - num
-        if not wanted:
+        num_added = round(num * float(self.share))
+        room = min(self.cap, model.gaussians.num) - num
+        if not num_added:
             return Change(model, moments, state, unused=f"share of {num:,} Gaussians is less than one: raise it")
         if room <= 0:
             reason = "share adds no Gaussian, because there are as many as the cap allows; prune some before"
             return Change(model, moments, state, unused=reason)
         rng = np.random.default_rng(due.index)
-        added = gaussians_at_errors(model, due.views, due.background, min(wanted, room), rng)
+        added = gaussians_at_errors(model, due.views, due.background, min(num_added, room), rng)
         if not added.num:
             reason = "share adds no Gaussian, because views are right wherever a surface is drawn and masks count"
             return Change(model, moments, state, unused=reason)
@@ -94,20 +95,20 @@ class PlaceByError(HostEvent):
             changed[rows] = new
             return jax.device_put(changed)
 
-        own = model.gaussians, model.appearance
-        gaussians, shown = map_rows(replaced, replaced, own, (added, appearance))
+        present = model.gaussians, model.appearance
+        gaussians, appearance = map_rows(replaced, replaced, present, (added, appearance))
         is_new = np.isin(np.arange(model.gaussians.num), rows)
         moments = jax.jit(clear_moments)(model, moments, is_new)
         num_live = jax.device_put(np.asarray(num + added.num, np.int32))
-        model = dataclasses.replace(model, gaussians=gaussians, appearance=shown, num_live=num_live)
+        model = dataclasses.replace(model, gaussians=gaussians, appearance=appearance, num_live=num_live)
         return Change(model, moments, state)
 
 
 def gaussians_at_errors(
     model: Model, views: Sequence[View], background: Color, num: int, rng: np.random.Generator
 ) -> Gaussians:
-    """Return `num` Gaussians at pixels of some views, drawn in proportion to the mean difference of their colours;
-    none where masks do not count or no surface is drawn. None at all if no pixel is wrong (host).
+    """Return `num` Gaussians at pixels of some views, drawn in proportion to the mean difference of their colours
+    (host). Pixels that masks exclude, or that show no surface, are left out. If no pixel is wrong there are none.
 
     Raises:
       ValueError: if there are no views.
@@ -118,19 +119,20 @@ def gaussians_at_errors(
     dtype = model.gaussians.means.dtype
     settings = room_for(model, [view.camera for view in views])
     behind = jnp.asarray(background, dtype)
-    totals, drawn = [], []
+    totals = []
+    drawn = []
     for view in views:
         camera = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), view.camera)
         output, _ = jitted_render()(
             model.gaussians, camera, model.appearance, behind, settings, num_live=model.num_live
         )
-        total, found = _drawn_pixels(view, background, jax.tree.map(np.asarray, output), num, rng)
+        total, pixels = _drawn_pixels(view, background, jax.tree.map(np.asarray, output), num, rng)
         totals.append(total)
-        drawn.append(found)
+        drawn.append(pixels)
     if not sum(totals):
         return no_rows(0, model.gaussians.sh.shape[1], dtype)
     view_of = rng.choice(len(totals), num, p=np.asarray(totals) / sum(totals))
-    # Of each view as many as its share of the error, from as many that were drawn in it.
+    # Each Gaussian takes a pixel of a view that is drawn by its share of the error; every view has drawn `num` pixels.
     points, normals, colors, sizes = (np.stack(column)[view_of, np.arange(num)] for column in zip(*drawn, strict=True))
     arrays = (
         points,
@@ -149,7 +151,7 @@ def _drawn_pixels(
     normals [P, 3], colours [P, 3] and widths [P]."""
     photograph = view_image(view, background)
     is_usable = counted_pixels([view])[0, ..., 0] & (output.alpha >= LEAST_ALPHA)
-    is_usable &= np.isfinite(output.color).all(axis=2)  # Training says what to do about NaN.
+    is_usable &= np.isfinite(output.color).all(axis=2)  # Training reports NaN itself.
     if view.camera.rays is not None:
         is_usable &= np.isfinite(np.asarray(view.camera.rays)).all(axis=2)
     errors = np.where(is_usable, np.abs(output.color - photograph).mean(axis=2), 0).astype(np.float64)

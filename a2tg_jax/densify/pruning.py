@@ -102,18 +102,19 @@ def shown_in(model: Model, views: Sequence[View], least: float = 1.0) -> Contrib
     """
     if not views:
         raise ValueError("views must hold at least one view; got none")
-    total, num_views = np.zeros(model.gaussians.num), np.zeros(model.gaussians.num, np.int64)
+    total = np.zeros(model.gaussians.num)
+    num_views = np.zeros(model.gaussians.num, np.int64)
     if not len(total):
         return Contributions(total, num_views)
     dtype = model.gaussians.means.dtype
     settings = room_for(model, [view.camera for view in views])
-    for own in views_by_kind(views):
-        rays = own[0].camera.rays
+    for alike in views_by_kind(views):
+        rays = alike[0].camera.rays
         rays = None if rays is None else jnp.asarray(rays, dtype)
-        cameras = [dataclasses.replace(view.camera, rays=None) for view in own]
+        cameras = [dataclasses.replace(view.camera, rays=None) for view in alike]
         stacked: Any = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves), dtype), *cameras)
-        counted = jnp.asarray(counted_pixels(own), dtype)
-        arrays = stacked, rays, counted, jnp.asarray(least, dtype)
+        pixels = jnp.asarray(counted_pixels(alike), dtype)
+        arrays = stacked, rays, pixels, jnp.asarray(least, dtype)
         weights, num = jax.jit(_weights, static_argnums=(5,))(model, *arrays, settings)
         total += np.asarray(weights).astype(np.float64)
         num_views += np.asarray(num)
@@ -121,13 +122,13 @@ def shown_in(model: Model, views: Sequence[View], least: float = 1.0) -> Contrib
 
 
 def _weights(
-    model: Model, cameras: Camera, rays: Array | None, counted: Array, least: Array, settings: RenderSettings
+    model: Model, cameras: Camera, rays: Array | None, pixels: Array, least: Array, settings: RenderSettings
 ) -> tuple[Array, Array]:
-    """Return the sums over views of one size and lens, and the numbers of views with at least `least`. A picture is
-    linear in features, so this is a backward pass of ones."""
+    """Return the sums of weights over the counted pixels of views of one size and lens, and the numbers of views with
+    at least `least`. An image is linear in features, so the backward pass of ones gives the weights."""
     nothing = jnp.zeros_like(model.gaussians.means)
 
-    def of_view(found: tuple[Array, Array], view: tuple[Camera, Array]) -> tuple[tuple[Array, Array], None]:
+    def add_view(sums: tuple[Array, Array], view: tuple[Camera, Array]) -> tuple[tuple[Array, Array], None]:
         camera, weight = view
         camera = dataclasses.replace(camera, rays=rays)
 
@@ -142,13 +143,13 @@ def _weights(
 
         color, back = jax.vjp(draw, nothing)
         (weights,) = back(jnp.broadcast_to(weight, color.shape))
-        total, num = found
+        total, num = sums
         # All three channels have the same weights.
         return (total + weights[:, 0], num + (weights[:, 0] >= least).astype(num.dtype)), None
 
     none = jnp.zeros(len(nothing), jnp.int32)
-    found, _ = jax.lax.scan(of_view, (nothing[:, 0], none), (cameras, counted))
-    return found
+    sums, _ = jax.lax.scan(add_view, (nothing[:, 0], none), (cameras, pixels))
+    return sums
 
 
 # Floaters
@@ -189,11 +190,12 @@ class PruneFloaters(HostEvent):
         return 2  # Rows keep their number; tile lists grow with the Gaussians.
 
     def apply(self, due: Due, model: Model, moments: AdamState, state: object) -> Change:
-        num, means = model.num, np.asarray(model.gaussians.means)[: model.num]
+        num = model.num
+        means = np.asarray(model.gaussians.means)[: model.num]
         is_kept = np.ones(num, bool)
         if self.min_views:
             num_views = shown_in(model, due.views, self.least).num_views[:num]
-            # Fewer training views than that could keep nothing.
+            # With fewer training views than that, no Gaussian would be kept.
             is_kept = num_views >= min(self.min_views, len(due.views))
         if self.near:
             is_kept &= ~are_near(means, due.views, self.near)
@@ -212,19 +214,23 @@ def are_near(means: np.ndarray, views: Sequence[View], near: float) -> np.ndarra
 
     The picture of a lens that is no pinhole is the smallest rectangle in the image plane that holds all its rays.
     """
-    found = np.zeros(len(means), bool)
-    for camera in (view.camera for view in views):
-        viewmat, K = np.asarray(camera.viewmat, np.float64), np.asarray(camera.K, np.float64)
+    is_near = np.zeros(len(means), bool)
+    for view in views:
+        camera = view.camera
+        viewmat = np.asarray(camera.viewmat, np.float64)
+        K = np.asarray(camera.K, np.float64)
         x, y, z = viewmat[:3, :3] @ means.T + viewmat[:3, 3:]
         # Behind the camera nothing is inside: comparisons with NaN are False.
         depth = np.where(z > 0, z, np.nan)
         column, row, _ = K @ np.stack([x / depth, y / depth, np.ones_like(z)])
-        (left, top), (right, bottom) = np.zeros(2), np.asarray([camera.width, camera.height])
+        low = np.zeros(2)
+        high = np.asarray([camera.width, camera.height])
         if camera.rays is not None:
             rays = np.asarray(camera.rays, np.float64).reshape(-1, 2)
             # Without any ray left, the rectangle is inverted and contains nothing.
             rays = rays[np.isfinite(rays).all(axis=1)]
-            (left, top), (right, bottom) = rays.min(axis=0, initial=np.inf), rays.max(axis=0, initial=-np.inf)
-        is_inside = (column >= left) & (column <= right) & (row >= top) & (row <= bottom)
-        found |= is_inside & (z < near)
-    return found
+            low = rays.min(axis=0, initial=np.inf)
+            high = rays.max(axis=0, initial=-np.inf)
+        is_inside = (column >= low[0]) & (column <= high[0]) & (row >= low[1]) & (row <= high[1])
+        is_near |= is_inside & (z < near)
+    return is_near

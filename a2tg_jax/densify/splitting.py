@@ -4,9 +4,9 @@
 detail is missing. Here the weight of a host is the change of the loss by a move of its own size. Host and copies become
 halves, each at a point drawn from the host and 1.6 times smaller, as in adaptive density control (`densify`).
 
-A splat below the low-pass filter is drawn as large as the filter, however small it is. Two halves of it that kept its
-opacity would be twice as opaque together, where two halves of a large splat cover 2/1.6² = 0.78 of its area. So halves
-share opacity in proportion to what the filter adds to their area (`logits_of_halves`).
+The low-pass filter draws every splat at least as large as itself. Two halves of a smaller splat that kept its opacity
+would cover the same pixels and be about twice as opaque together; two halves of a large splat cover 2/1.6² = 0.78 of its
+area. So halves share opacity in proportion to what the filter adds to their area (`logits_of_halves`).
 
 Hosts are drawn without replacement. A splat at an outlying point covers whole views, so its weight is thousands of
 times larger than others: with replacement it would be the host of nearly all new Gaussians.
@@ -68,7 +68,8 @@ class SplitByGradient(FillingMcmc):
         draw = functools.partial(draw_distinct_hosts, draw_weights(model, state))
         moves = plan_relocation(to_move, model.appearance.opacities(model.gaussians), num_live, draw)
         model, moments, state = split_rows(to_split, moves, model, moments, state)
-        cap, least = min(self.cap, model.gaussians.num), self.least(now, num_live)
+        cap = min(self.cap, model.gaussians.num)
+        least = self.least(now, num_live)
         # Rows that have moved are smaller now and share their statistic.
         draw = functools.partial(draw_distinct_hosts, draw_weights(model, state))
         moves = plan_growth(to_add, model.appearance.opacities(model.gaussians), num_live, cap, least, draw)
@@ -100,9 +101,9 @@ def split_rows(
 ) -> tuple[Model, AdamState, SplitStatistics]:
     """Copy rows from their hosts. Hosts and copies are halved, lose Adam's moments and share the statistic."""
     is_split = moves.is_reset | (moves.rows != jnp.arange(model.gaussians.num, dtype=jnp.int32))
-    pixels, found = state.pixels[moves.rows], state.gradients
-    total = found.total / moves.num_shares.astype(found.total.dtype)
-    gradients = GradientStatistics(total[moves.rows], found.views[moves.rows])
+    pixels = state.pixels[moves.rows]
+    total = state.gradients.total / moves.num_shares.astype(state.gradients.total.dtype)
+    gradients = GradientStatistics(total[moves.rows], state.gradients.views[moves.rows])
     # On the screen, halves are 1.6 times smaller as well.
     state = SplitStatistics(gradients, jnp.where(is_split, pixels / SPLIT_SHRINK, pixels))
     moments = clear_moments(model, moments, is_split)
@@ -123,8 +124,8 @@ def logits_of_halves(logit_opacities: Array, pixels: Array) -> Array:
     it, halves would have 1/1.6² of that area. Where the filter makes them k times larger, k in 1..1.6², their opacity
     is 1 − (1 − o)^(1/k), but not below the death opacity. Splats of 0 pixels, which no view has shown, keep theirs.
     """
-    before = jnp.maximum(pixels * pixels, FILTER_VARIANCE)
-    after = jnp.maximum((pixels / SPLIT_SHRINK) ** 2, FILTER_VARIANCE)
-    ratio = SPLIT_SHRINK**2 * after / before
+    whole = jnp.maximum(pixels * pixels, FILTER_VARIANCE)
+    half = jnp.maximum((pixels / SPLIT_SHRINK) ** 2, FILTER_VARIANCE)
+    ratio = SPLIT_SHRINK**2 * half / whole
     shared = logit(shared_opacities(logit_opacities, ratio))
     return jnp.where((pixels > 0) & (ratio > 1), jnp.minimum(shared, logit_opacities), logit_opacities)

@@ -50,7 +50,8 @@ class ViewDependence:
 
     def strengths(self) -> np.ndarray:
         """Return [N, 3] norm of the average gradient at the coefficients of degree 1, 2 and 3 (host)."""
-        total, views = np.asarray(self.total), max(1, int(self.views))
+        total = np.asarray(self.total)
+        views = max(1, int(self.views))
         bands = [total[:, first:end] / views for first, end in itertools.pairwise(NUM_BASES)]
         return np.stack([np.linalg.norm(band, axis=(1, 2)) for band in bands], axis=1)
 
@@ -83,7 +84,7 @@ class AdaptDegrees(HostEvent):
         return iterations_at(self.at, num_iterations)
 
     def num_programs(self, num_iterations: int) -> int:
-        return 0  # Tables have room, unless degrees may take more than half of the budget.
+        return 0  # `with_room` has made room, unless degrees may take more than half of the budget.
 
     def most_bytes(self, num_bytes: float, num: int, num_iterations: int) -> float:
         of_bands = BYTES_PER_FLOAT * 3 * NUM_BASES[self.highest] * num
@@ -92,7 +93,8 @@ class AdaptDegrees(HostEvent):
     def with_room(
         self, model: Model, moments: AdamState, num_bytes: float, num_iterations: int
     ) -> tuple[Model, AdamState]:
-        table, base = model.appearance.coefficients, model.gaussians.sh_degree
+        table = model.appearance.coefficients
+        base = model.gaussians.sh_degree
         if table is None:
             return model, moments
         budget = bytes_of(self.budget_mb)
@@ -113,7 +115,9 @@ class AdaptDegrees(HostEvent):
         return state.observe(model.gaussians.means, centers, seen.colors)
 
     def apply(self, due: Due, model: Model, moments: AdamState, state: ViewDependence) -> Change:
-        table, base, num = model.appearance.coefficients, model.gaussians.sh_degree, model.num
+        table = model.appearance.coefficients
+        base = model.gaussians.sh_degree
+        num = model.num
         if table is None:
             raise ValueError(
                 f"{in_words(model.appearance)} cannot raise degrees: the stage needs Appearance(bands=Bands())"
@@ -152,9 +156,11 @@ def without_idle(table: Coefficients, base_degree: int, idle: float) -> np.ndarr
     degrees = degrees_of_sizes(table.sizes, base_degree)
     for blocks, owners in zip(table.buckets, table.owners, strict=True):
         if blocks.size:
-            rows, values = np.asarray(owners), np.asarray(blocks)
+            rows = np.asarray(owners)
+            values = np.asarray(blocks)
             is_used = rows < table.num
-            rows, values = rows[is_used], values[is_used]
+            rows = rows[is_used]
+            values = values[is_used]
             # All blocks of a bucket are of one degree.
             last = floats_of_band(int(degrees[rows[0]])) // 3 if len(rows) else 0
             energy = np.square(values[:, values.shape[1] - last :]).sum(axis=(1, 2)) / (12 * np.pi)

@@ -52,13 +52,14 @@ def color_fit(image: ArrayLike, target: ArrayLike, mask: ArrayLike | None = None
     if mask is not None:
         check_mask("mask", mask, np.shape(image)[:2])
     counts = np.ones(np.shape(image)[:2], bool) if mask is None else np.asarray(mask)
-    colors, wanted = np.asarray(image, np.float64)[counts], np.asarray(target, np.float64)[counts]
-    for name, values in (("image", colors), ("target", wanted)):
+    colors = np.asarray(image, np.float64)[counts]
+    targets = np.asarray(target, np.float64)[counts]
+    for name, values in (("image", colors), ("target", targets)):
         if not np.isfinite(values).all():
             raise ValueError(f"{name} must be finite where its pixels count; it has NaN or infinite colours")
     inputs = np.concatenate([colors, np.ones((len(colors), 1))], axis=1)
     # Normal equations, 4 × 4, instead of a row a pixel; lstsq takes the least solution of singular ones.
-    return np.linalg.lstsq(inputs.T @ inputs, inputs.T @ wanted, rcond=None)[0].T
+    return np.linalg.lstsq(inputs.T @ inputs, inputs.T @ targets, rcond=None)[0].T
 
 
 def align_poses(
@@ -94,17 +95,21 @@ def align_poses(
     model = model.live
     background = jnp.asarray(model.background if background is None else background, model.gaussians.means.dtype)
     planned = plan_render(model, [view.camera for view in views], head_room=HEAD_ROOM, settings=settings)
-    descend, aligned = jax.jit(_descent, static_argnums=(6, 7)), []
+    descend = jax.jit(_descent, static_argnums=(6, 7))
+    aligned = []
     for view in views:
         target = jnp.asarray(view_image(view, np.asarray(background)), background.dtype)
         mask = None if view.mask is None else jnp.asarray(view.mask.read())[..., None]
         camera = jax.tree.map(lambda x: jnp.asarray(x, background.dtype), view.camera)
-        inputs, settings = (model.gaussians, model.appearance, camera, target, mask, background), planned
+        inputs = (model.gaussians, model.appearance, camera, target, mask, background)
+        settings = planned
+        twist, is_full = descend(*inputs, settings, num_steps)
         # A full tile list drops splats, which makes the loss wrong: the descent is repeated.
-        while (found := descend(*inputs, settings, num_steps))[1]:
+        while is_full:
             assert settings.capacity is not None
             settings = dataclasses.replace(settings, capacity=2 * settings.capacity)
-        viewmat = moved_viewmat(found[0], camera.viewmat).astype(jnp.float32)
+            twist, is_full = descend(*inputs, settings, num_steps)
+        viewmat = moved_viewmat(twist, camera.viewmat).astype(jnp.float32)
         aligned.append(dataclasses.replace(view, camera=dataclasses.replace(view.camera, viewmat=viewmat)))
     return tuple(aligned)
 
@@ -116,19 +121,20 @@ def _descent(
     """Return the twist with the smallest loss on Adam's path, and whether a render needs more capacity."""
     # SSIM needs a whole window.
     ssim_weight = 0.2 if min(target.shape[:2]) >= SSIM_WINDOW else 0.0
-    shown = target if mask is None else jnp.where(mask, target, 0.0)
+    photograph = target if mask is None else jnp.where(mask, target, 0.0)
 
     def loss(twist: Array) -> Any:
         moved = dataclasses.replace(camera, viewmat=moved_viewmat(twist, camera.viewmat))
         output, _ = render_traced(gaussians, moved, appearance, background, settings, has_geometry=False)
         color = output.color if mask is None else jnp.where(mask, output.color, 0.0)
-        return photometric_loss(color, shown, ssim_weight=ssim_weight), output.overflow
+        return photometric_loss(color, photograph, ssim_weight=ssim_weight), output.overflow
 
     def step(carry: Any, index: Array) -> tuple[Any, None]:
         twist, moments, least, best, is_full = carry
         (value, overflow), grad = jax.value_and_grad(loss, has_aux=True)(twist)
         # A NaN loss is not less, so it is never kept.
-        best, least = jnp.where(value < least, twist, best), jnp.where(value < least, value, least)
+        best = jnp.where(value < least, twist, best)
+        least = jnp.where(value < least, value, least)
         rate = FIRST_RATE * (LAST_RATE / FIRST_RATE) ** (index / num_steps)
         twist, moments = adam_update(twist, grad, moments, rate)
         return (twist, moments, least, best, is_full | overflow), None

@@ -153,7 +153,8 @@ def evaluate(
     seconds: list[float] = []
     renders: list[np.ndarray] = []
     for view in views:
-        image, target = renderer(view.camera).color, jnp.asarray(view_image(view, background))
+        image = renderer(view.camera).color
+        target = jnp.asarray(view_image(view, background))
         if len(seconds) < NUM_TIMED:
             seconds.append(min(_seconds(renderer, view.camera) for _ in range(3)))
         mask = None if view.mask is None else jnp.asarray(view.mask.read())

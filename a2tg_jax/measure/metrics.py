@@ -77,7 +77,7 @@ def ssim(image: Array, target: Array, mask: Array | None = None) -> Array:
     similarity = losses.mean_ssim(*_clip_pair(image, target, mask))
     if mask is None:
         return similarity
-    # Windows without such pixels are equal, and count 1 each.
+    # Windows without counted pixels are equal, and count 1 each.
     window = (losses.SSIM_WINDOW, losses.SSIM_WINDOW)
     counts = jnp.asarray(mask).astype(similarity.dtype)
     # The windows of `mean_ssim`: VALID, stride 1.
@@ -176,9 +176,11 @@ def parameter_bytes(gaussians: Gaussians, textures: Textures | None = None) -> i
 
 def _clip_pair(image: Array, target: Array, mask: Array | None = None) -> tuple[Array, Array]:
     """Return both images in [0, 1], and black where pixels do not count."""
-    image, target = plain_array("image", image), plain_array("target", target)
+    image = plain_array("image", image)
+    target = plain_array("target", target)
     losses.check_same_shape(image, target)
-    image, target = jnp.clip(image, 0, 1), jnp.clip(target, 0, 1)
+    image = jnp.clip(image, 0, 1)
+    target = jnp.clip(target, 0, 1)
     if mask is None:
         return image, target
     mask = plain_array("mask", mask)
@@ -216,18 +218,18 @@ def _load_lpips(path: Path) -> LpipsWeights:
 
 def _alexnet(arrays: Mapping[str, np.ndarray], x: Array) -> list[Array]:
     """Return the five ReLU outputs of torchvision's AlexNet that LPIPS compares; x and they are NHWC."""
-    shown = [_conv_relu(arrays, "features.0", x, stride=4, padding=2)]
+    outputs = [_conv_relu(arrays, "features.0", x, stride=4, padding=2)]
     # torchvision's indices; pooling comes before the second and third convolution only.
     for layer, padding in ((3, 2), (6, 1), (8, 1), (10, 1)):
-        pooled = _max_pool(shown[-1]) if layer < 8 else shown[-1]
-        shown.append(_conv_relu(arrays, f"features.{layer}", pooled, padding=padding))
-    return shown
+        pooled = _max_pool(outputs[-1]) if layer < 8 else outputs[-1]
+        outputs.append(_conv_relu(arrays, f"features.{layer}", pooled, padding=padding))
+    return outputs
 
 
 def _squeezenet(arrays: Mapping[str, np.ndarray], x: Array) -> list[Array]:
     """Return the seven outputs of torchvision's SqueezeNet 1.1 that LPIPS compares; x and they are NHWC."""
     x = _conv_relu(arrays, "features.0", x, stride=2)
-    shown = [x]
+    outputs = [x]
     for layer in (3, 4, 6, 7, 9, 10, 11, 12):
         if layer in (3, 6, 9):
             x = _max_pool(x, is_ceil=True)
@@ -238,8 +240,8 @@ def _squeezenet(arrays: Mapping[str, np.ndarray], x: Array) -> list[Array]:
         x = jnp.concatenate([narrow, wide], axis=-1)
         # LPIPS takes the last fire module before each pooling, and all after the last.
         if layer not in (3, 6):
-            shown.append(x)
-    return shown
+            outputs.append(x)
+    return outputs
 
 
 _FEATURES = {"alex": _alexnet, "squeeze": _squeezenet}

@@ -71,7 +71,8 @@ def composite(
 
 def _assemble(tiles: Array, grid: TileGrid) -> Array:
     """Assemble tiles [tiles, ..., P] into one image [..., H, W]."""
-    inner, size = tiles.shape[1:-1], grid.tile_size
+    inner = tiles.shape[1:-1]
+    size = grid.tile_size
     # [rows, columns, ..., y, x] to [..., rows, y, columns, x]; the last tiles may reach beyond the image.
     blocks = tiles.reshape(grid.rows, grid.columns, *inner, size, size)
     image = jnp.moveaxis(blocks, (0, 1), (-4, -2))
@@ -105,7 +106,8 @@ def _lists_on(platform: str, compositor: Wanted, near_plane: float, grid: TileGr
 
 def _forward(settings: PassSettings, *arrays: Any) -> tuple[Array, Array]:
     """Return channels [tiles, D, P] and transmittance [tiles, P], given fields of `PassInputs`, jacobian and probe."""
-    inputs, tiles = PassInputs(*arrays[:5]), settings.grid.num
+    inputs = PassInputs(*arrays[:5])
+    tiles = settings.grid.num
     shapes = (tiles, settings.num_channels, settings.num_pixels), (tiles, settings.num_pixels)
     results = tuple(jax.ShapeDtypeStruct(shape, inputs.splats.M.dtype) for shape in shapes)
     return _by_platform("forward", settings, results, inputs)

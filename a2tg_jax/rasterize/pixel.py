@@ -83,7 +83,9 @@ def _from_center(column: Triple, tile: TileNumbers) -> Triple:
     """Return a column of the homography to pixels counted from the tile's centre, in its frame if it has one."""
     x, y, *frame = tile
     # Before any product: this keeps float32 exact to 1e-4.
-    first, second, last = column[0] - x * column[2], column[1] - y * column[2], column[2]
+    first = column[0] - x * column[2]
+    second = column[1] - y * column[2]
+    last = column[2]
     if frame:
         xx, xy, yx, yy = frame
         first, second = xx * first + xy * second, yx * first + yy * second
@@ -98,7 +100,9 @@ def planes_of(M: Rows, tile: TileNumbers) -> Planes:
     first, second, last = zip(*(_from_center(column, tile) for column in zip(*M, strict=True)), strict=True)
     # 2DGS: the pixel's ray is the intersection of the planes k = x·M₂ − M₀ and l = y·M₂ − M₁, and p = k × l. It is
     # bilinear: x and y multiply the cross products with the last row, and x·y the one of the last row with itself, 0.
-    a, b, c = _cross(second, last), _cross(last, first), _cross(first, second)
+    a = _cross(second, last)
+    b = _cross(last, first)
+    c = _cross(first, second)
     p0, p1, p2 = ((a[k], b[k], c[k]) for k in range(3))
     determinant = last[0] * c[0] + last[1] * c[1] + last[2] * c[2]
     return Planes(p0, p1, p2, determinant, center_x=first[2] / last[2], center_y=second[2] / last[2], depth=last[2])
@@ -117,7 +121,8 @@ def intersect(planes: Planes, x: Array, y: Array, near_plane: float, has_low_pas
     p0, p1, p2 = (plane[0] * x + plane[1] * y + plane[2] for plane in planes[:3])
     # Far out on a nearly parallel plane u² would overflow, as would 1/p₂² for the tiniest splats: the divisor is
     # clamped there, with a finite gradient. With |u| <= ∛max, u² and its product with u stay finite.
-    far, tiny = float(np.cbrt(np.finfo(p2.dtype).max)), float(np.sqrt(np.finfo(p2.dtype).tiny))
+    far = float(np.cbrt(np.finfo(p2.dtype).max))
+    tiny = float(np.sqrt(np.finfo(p2.dtype).tiny))
     q0, q1, q2, determinant = jax.lax.stop_gradient((p0, p1, p2, planes.determinant))
     least = _larger(_larger(jnp.abs(q0), jnp.abs(q1)), jnp.abs(determinant)) * (1 / far)
     least = jnp.maximum(least, tiny)
@@ -126,15 +131,18 @@ def intersect(planes: Planes, x: Array, y: Array, near_plane: float, has_low_pas
     inverse = 1 / jnp.where(is_far, jnp.where(q2 < 0, -least, least), p2)
     depth = planes.determinant * inverse
     is_hit = ~is_parallel & (depth >= near_plane)
-    u, v = jnp.where(is_hit, p0 * inverse, 0.0), jnp.where(is_hit, p1 * inverse, 0.0)
+    u = jnp.where(is_hit, p0 * inverse, 0.0)
+    v = jnp.where(is_hit, p1 * inverse, 0.0)
 
     rho_ray = u * u + v * v
     if not has_low_pass:
         return Hit(u, v, jnp.where(is_hit, rho_ray, jnp.inf), jnp.where(is_hit, depth, planes.depth), is_hit, inverse)
-    dx, dy = x - planes.center_x, y - planes.center_y
+    dx = x - planes.center_x
+    dy = y - planes.center_y
     rho_screen = 2 * (dx * dx + dy * dy)
     is_ray = is_hit & (rho_ray <= rho_screen)
-    rho, depth = jnp.where(is_ray, rho_ray, rho_screen), jnp.where(is_ray, depth, planes.depth)
+    rho = jnp.where(is_ray, rho_ray, rho_screen)
+    depth = jnp.where(is_ray, depth, planes.depth)
     return Hit(u, v, rho, depth, is_ray, inverse)
 
 
@@ -276,8 +284,10 @@ def positional_gradient(
     def like_rho(mean: Triple) -> Array:
         """Return a number with the gradient of ρ."""
         k2, l2 = ray(mean)
-        u, v = (k1 * l2 - k2 * l1) * hit.inverse, (k2 * l0 - k0 * l2) * hit.inverse
-        dx, dy = k2 / mean[2], l2 / mean[2]
+        u = (k1 * l2 - k2 * l1) * hit.inverse
+        v = (k2 * l0 - k0 * l2) * hit.inverse
+        dx = k2 / mean[2]
+        dy = l2 / mean[2]
         # 2·(hit.u·u + hit.v·v), with constants hit.u and hit.v, has the gradient of u² + v² at the hit.
         return jnp.where(hit.is_ray, 2 * (hit.u * u + hit.v * v), 2 * (dx * dx + dy * dy))
 
@@ -287,14 +297,17 @@ def positional_gradient(
         components = [sum(d_mean[i] * jacobian[i][axis] for i in range(3)) for axis in range(3)]
         return tuple(jnp.abs(component) for component in components)  # type: ignore[return-value]
     # c = (M₀₂, M₁₂)/M₂₂, so that this is ∂L/∂c if the low-pass filter decides.
-    dx, dy = d_mean[0] * mean[2], d_mean[1] * mean[2]
+    dx = d_mean[0] * mean[2]
+    dy = d_mean[1] * mean[2]
     if len(tile) == 6:
         # ∂L/∂place = Fᵀ·∂L/∂pixel for pixel = F·place: this solves for ∂L/∂pixel.
         _, _, xx, xy, yx, yy = tile
         inverse = 1 / (xx * yy - xy * yx)
         dx, dy = (yy * dx - yx * dy) * inverse, (xx * dy - xy * dx) * inverse
     if statistic == "center":
-        dx, dy = jnp.where(hit.is_ray, dx, 0.0), jnp.where(hit.is_ray, dy, 0.0)
+        dx = jnp.where(hit.is_ray, dx, 0.0)
+        dy = jnp.where(hit.is_ray, dy, 0.0)
     else:
-        dx, dy = jnp.where(hit.is_ray, 0.0, jnp.abs(dx)), jnp.where(hit.is_ray, 0.0, jnp.abs(dy))
+        dx = jnp.where(hit.is_ray, 0.0, jnp.abs(dx))
+        dy = jnp.where(hit.is_ray, 0.0, jnp.abs(dy))
     return dx, dy, jnp.zeros_like(dx)

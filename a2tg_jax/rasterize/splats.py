@@ -117,9 +117,12 @@ def project_gaussians(
       ValueError: if the appearance gives opacities, numbers or colours of another shape.
     """
     M, normals = appearance.homographies(gaussians, camera)
-    opacities, numbers = appearance.peak_opacities(gaussians), numbers_in_view(appearance, gaussians, camera, sh_degree)
+    opacities = appearance.peak_opacities(gaussians)
+    numbers = numbers_in_view(appearance, gaussians, camera, sh_degree)
     colors = colors_in_view(appearance, gaussians, camera, sh_degree)
-    name, num, num_colors = type(appearance).__name__, gaussians.num, num_colors_of(appearance)
+    name = type(appearance).__name__
+    num = gaussians.num
+    num_colors = num_colors_of(appearance)
     if opacities.shape != (num,) or numbers.shape[:-1] != (num,):
         raise ValueError(
             f"an appearance gives opacities [N] and numbers [N, K] of N = {num} gaussians; {name} "
@@ -203,7 +206,9 @@ def pack_inputs(settings: PassSettings, inputs: PassInputs) -> tuple[Array, ...]
     Rays of pixels are packed by `native.composite`.
     """
     splats, texels, regions, cutoff, lists = inputs
-    dtype, num, capacity = splats.M.dtype, splats.M.shape[0], lists.ids.shape[0]
+    dtype = splats.M.dtype
+    num = splats.M.shape[0]
+    capacity = lists.ids.shape[0]
     packed = pack_splats(splats, settings.has_geometry, cutoff).astype(dtype)
     size = jnp.asarray([settings.grid.columns, settings.grid.width, settings.grid.height], jnp.int32)
     # Threads divide the tiles by their starts, which must ascend. Without splats no id is valid: all lists are empty.

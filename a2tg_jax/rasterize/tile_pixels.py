@@ -94,8 +94,10 @@ def covered_tiles(
     for axis in range(2):  # Over the rows for the columns, over the columns for the rows.
         # Lenses bend rows and columns, so that spans overlap and need not be in order. The largest end so far and the
         # least begin from here on are, and contain them: they can be searched by halves.
-        begun, reached = jnp.min(begins[..., axis], axis=axis), jnp.max(ends[..., axis], axis=axis)
-        begun, reached = jax.lax.cummin(begun, reverse=True), jax.lax.cummax(reached)
+        begun = jnp.min(begins[..., axis], axis=axis)
+        reached = jnp.max(ends[..., axis], axis=axis)
+        begun = jax.lax.cummin(begun, reverse=True)
+        reached = jax.lax.cummax(reached)
         first = jnp.searchsorted(reached, low[axis], side="left").astype(jnp.int32)
         end = jnp.searchsorted(begun, high[axis], side="right").astype(jnp.int32)
         is_covered = (low[axis] <= high[axis]) & (first < end)

@@ -62,7 +62,8 @@ def tile_rectangles(bounds: ScreenBounds, grid: TileGrid, pixels: TilePixels | N
         y0, rows = _tile_span(bounds.top, bounds.bottom, grid.height, grid.tile_size)
     else:
         reach = jnp.max(bounds.outline.radius, initial=0.0)
-        low, high = (bounds.left, bounds.top), (bounds.right, bounds.bottom)
+        low = (bounds.left, bounds.top)
+        high = (bounds.right, bounds.bottom)
         (x0, columns), (y0, rows) = covered_tiles(pixels, grid.columns, reach, low, high)
     # Without rows there are no columns either: counts may be divided by them.
     columns = jnp.where(rows > 0, columns, jnp.int32(0))
@@ -71,13 +72,17 @@ def tile_rectangles(bounds: ScreenBounds, grid: TileGrid, pixels: TilePixels | N
 
 def _tile_span(low: Array, high: Array, size: int, tile_size: int) -> tuple[Array, Array]:
     """Return the first tile along an axis with a pixel centre in [low, high], and the number of such tiles."""
-    nothing, last_pixel, side = jnp.int32(0), jnp.int32(size - 1), jnp.int32(tile_size)
+    nothing = jnp.int32(0)
+    last_pixel = jnp.int32(size - 1)
+    side = jnp.int32(tile_size)
     # Pixel k has its centre at k + ½. Clipped as floats, for the conversion of larger ones is not defined.
     edges = jnp.ceil(low - 0.5), jnp.floor(high - 0.5)
     first, last = (jnp.clip(edge, -1.0, 1e6).astype(jnp.int32) for edge in edges)
-    first, last = jnp.maximum(first, nothing), jnp.minimum(last, last_pixel)
+    first = jnp.maximum(first, nothing)
+    last = jnp.minimum(last, last_pixel)
     # Not //, which is slower for the sake of negative numbers; only `last` can be one, -1, less than `first`.
-    begin, end = jax.lax.div(first, side), jax.lax.div(last, side) + 1
+    begin = jax.lax.div(first, side)
+    end = jax.lax.div(last, side) + 1
     return begin, jnp.where(last < first, nothing, end - begin)
 
 
@@ -92,7 +97,8 @@ def outline_touches(outline: Outline, x0: Array, y0: Array, tile_size: int) -> A
     """Return whether an outline reaches a pixel centre of the tile with first pixel (x0, y0); element-wise."""
 
     def box_from(origin_x: Array, origin_y: Array) -> tuple[Array, Array, Array, Array]:
-        left, top = x0 + 0.5 - origin_x, y0 + 0.5 - origin_y
+        left = x0 + 0.5 - origin_x
+        top = y0 + 0.5 - origin_y
         return left, left + (tile_size - 1), top, top + (tile_size - 1)
 
     return _touches(outline, box_from)
@@ -101,9 +107,12 @@ def outline_touches(outline: Outline, x0: Array, y0: Array, tile_size: int) -> A
 def _touches(outline: Outline, box_from: Callable[[Array, Array], tuple[Array, Array, Array, Array]]) -> Array:
     """Return whether an outline reaches a box, given its left, right, top and bottom edge from an origin."""
     left, right, top, bottom = box_from(outline.ellipse_x, outline.ellipse_y)
-    xx, xy, yy = outline.xx, outline.xy, outline.yy
+    xx = outline.xx
+    xy = outline.xy
+    yy = outline.yy
     # The nearest point of the box in the ellipse's metric is on one of the two sides that face the centre.
-    x_side, y_side = jnp.clip(0.0, left, right), jnp.clip(0.0, top, bottom)
+    x_side = jnp.clip(0.0, left, right)
+    y_side = jnp.clip(0.0, top, bottom)
     y_on_side = jnp.clip(xy / xx * x_side, top, bottom)
     x_on_side = jnp.clip(xy / yy * y_side, left, right)
 
@@ -129,11 +138,13 @@ def tile_lists(
       capacity: number of pairs that fit, before the outline test.
       pixels: pixels of the tiles, if the camera has a ray for each pixel.
     """
-    bounds, depths = screen_bounds(M, cutoff, near_plane), M[:, 2, 2]
+    bounds = screen_bounds(M, cutoff, near_plane)
+    depths = M[:, 2, 2]
     order = jnp.argsort(depths, stable=True)
     unordered = tile_rectangles(bounds, grid, pixels)
     # Of counts that are not in order: a GPU would sum and gather in one slow kernel.
-    total, rectangles = total_pairs(unordered.counts), jax.tree.map(lambda x: x[order], unordered)
+    total = total_pairs(unordered.counts)
+    rectangles = jax.tree.map(lambda x: x[order], unordered)
     # The total is known to a relative error of about 2⁻²⁰.
     overflow = total + jnp.floor(total * 2.0**-20) > capacity
     # Empty lists instead of some that lack splats: an image that is plainly wrong, at no cost.
@@ -152,7 +163,8 @@ def tile_lists(
     dtype = bounds.left.dtype
     per_pair = jax.tree.map(lambda leaf: leaf[ids], bounds.outline)
     if pixels is None:
-        tile_x, tile_y = (x * grid.tile_size).astype(dtype), (y * grid.tile_size).astype(dtype)
+        tile_x = (x * grid.tile_size).astype(dtype)
+        tile_y = (y * grid.tile_size).astype(dtype)
         is_touched = outline_touches(per_pair, tile_x, tile_y, grid.tile_size)
     else:
         # Places that are left may be in no tile.
@@ -177,11 +189,13 @@ def _sort_by_tile(tile: Array, rank: Array, order: Array, num_tiles: int) -> tup
     rank_bits = max(1, (num - 1).bit_length())
     if num_tiles.bit_length() + rank_bits <= 32:
         key = jnp.sort(tile.astype(jnp.uint32) << rank_bits | rank.astype(jnp.uint32))
-        sorted_tile, sorted_rank = (key >> rank_bits).astype(jnp.int32), key & ((1 << rank_bits) - 1)
+        sorted_tile = (key >> rank_bits).astype(jnp.int32)
+        sorted_rank = key & ((1 << rank_bits) - 1)
         ids = order[sorted_rank].astype(jnp.int32)
     else:
         tile_type = jnp.uint16 if num_tiles < 2**16 else jnp.uint32
         sorted_tile, sorted_rank = jax.lax.sort((tile.astype(tile_type), rank), num_keys=1, is_stable=True)
-        ids, sorted_tile = order[sorted_rank].astype(jnp.int32), sorted_tile.astype(jnp.int32)
+        ids = order[sorted_rank].astype(jnp.int32)
+        sorted_tile = sorted_tile.astype(jnp.int32)
     starts = jnp.searchsorted(sorted_tile, jnp.arange(num_tiles + 1, dtype=jnp.int32), method="scan_unrolled")
     return ids, starts.astype(jnp.int32)

@@ -56,7 +56,8 @@ def render_traced(
     if settings.supersample > 1:
         if probe is not None:
             raise ValueError("supersample must be 1 where statistics of gradients are gathered")
-        finer, factor = settings.finer(camera), settings.supersample
+        finer = settings.finer(camera)
+        factor = settings.supersample
         settings = dataclasses.replace(settings, supersample=1)
         output, num_pairs = render_traced(
             gaussians, finer, appearance, background, settings,
@@ -71,7 +72,8 @@ def render_traced(
         return RenderOutput(color, alpha, output.overflow, geometry), num_pairs
     # Before anything is traced, so that the error does not come from deep within JAX.
     check_compositor(settings.compositor)
-    num, num_colors = gaussians.num, num_colors_of(appearance)
+    num = gaussians.num
+    num_colors = num_colors_of(appearance)
     if num == 0:
         size = camera.height, camera.width
         channels = jnp.zeros((num_colors + 5 * has_geometry, *size), background.dtype)
@@ -95,7 +97,8 @@ def render_traced(
     channels, transmittance = composite(compositing, splats, texels, regions, cutoff, lists, jacobian, probe)
     # A splat with a number that is not finite spoils the whole image: a sum would hide it behind the splats in front.
     taint = jnp.where(jnp.any(jnp.isnan(cutoff)), jnp.nan, 0.0).astype(channels.dtype)
-    channels, transmittance = channels + taint, transmittance + taint
+    channels = channels + taint
+    transmittance = transmittance + taint
     return _output(channels, transmittance, num_colors, has_geometry, background, lists.overflow), lists.num_pairs
 
 
@@ -107,7 +110,8 @@ def _output(
     if not has_geometry:
         return RenderOutput(color, alpha, overflow)
     # Σ_ij w_i w_j (z_i − z_j)² / 2 = Σ w · Σ w z² − (Σ w z)², without a double sum; alpha is Σ w.
-    depth, squared = channels[num_colors], channels[num_colors + 1]
+    depth = channels[num_colors]
+    squared = channels[num_colors + 1]
     normal = jnp.moveaxis(channels[num_colors + 2 :], 0, -1)
     return RenderOutput(color, alpha, overflow, Geometry(depth, normal, alpha * squared - depth * depth))
 

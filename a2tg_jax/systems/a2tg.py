@@ -144,7 +144,8 @@ class A2tg(TwoStages):
         """Check that the texture budget has room for the Gaussians of the first stage."""
         option = "initial_gaussians"
         if self.densify.cap:
-            option, num = "densify.cap", self.densify.grown(num, self.stage1_iterations)
+            option = "densify.cap"
+            num = self.densify.grown(num, self.stage1_iterations)
         self._check_budget(num, f"raise it, or lower {option}")
 
     def check_given_number(self, num: int) -> None:

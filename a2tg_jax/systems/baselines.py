@@ -223,14 +223,16 @@ class BBSplat(TwoStages):
     version: ClassVar[int] = 2
 
     def stages(self) -> tuple[Stage, ...]:
-        pictures, rates = Billboards(side=self.billboard.side), (self.billboard.rgb, self.billboard.alpha)
+        pictures = Billboards(side=self.billboard.side)
+        rates = (self.billboard.rgb, self.billboard.alpha)
         cap = self.budget_cap(FLOATS_PER_TEXEL * self.billboard.side**2 - 1)  # Their opacity is not trained.
         growth = self.densify if cap is None else FillingMcmc(cap)
         return self.continued(self.growing_stage((growth,), pictures, rates, name="billboards"))
 
     @classmethod
     def presets(cls) -> dict[str, Self]:
-        quick, smoke = BillboardOptions(rgb=1e-2, alpha=4e-3), BillboardOptions(side=8, rgb=1e-2, alpha=1e-2)
+        quick = BillboardOptions(rgb=1e-2, alpha=4e-3)
+        smoke = BillboardOptions(side=8, rgb=1e-2, alpha=1e-2)
         return cls.short_presets(
             {"loss": LossConfig(), "densify": Mcmc(cap=2_000), "billboard": quick},
             {"loss": LossConfig(), "densify": Mcmc(cap=800), "billboard": smoke, "stage2_iterations": 0},

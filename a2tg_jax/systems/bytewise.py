@@ -18,7 +18,8 @@ from a2tg_jax.mcmc import Noise, densify_times
 from a2tg_jax.systems.two_stages import PRUNING, LimitExponents, TwoStages, kernels_of, pruned
 from a2tg_jax.training.stage import Stage
 
-QUICK_CAP, SMOKE_CAP = 40_000, 2_000
+QUICK_CAP = 40_000
+SMOKE_CAP = 2_000
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -91,7 +92,8 @@ class Bytewise(TwoStages):
         rates = kernels.rates | {"bands": self.view_dependence_rate}
         detailed = dataclasses.replace(plain, bands=Bands())
         if self.view_dependence_share:
-            budget, highest = self._megabytes_before_texels(), min(self.sh_degree, self.view_dependence.highest)
+            budget = self._megabytes_before_texels()
+            highest = min(self.sh_degree, self.view_dependence.highest)
             events.append(dataclasses.replace(self.view_dependence, budget_mb=budget, highest=highest))
         if self.texture_share:
             budget = self._num_bytes() / MEGABYTE
@@ -145,7 +147,8 @@ class Bytewise(TwoStages):
             check_number(name, getattr(self, name), least=0, most=1)
         for name in ("fading_weight", "kernel_rate", "view_dependence_rate", "texel_rate"):
             check_number(name, getattr(self, name), least=0)
-        view, details = self.view_dependence, self.details
+        view = self.view_dependence
+        details = self.details
         by_shares = "the shares decide"
         decided: tuple[tuple[str, Any, str, str], ...] = (
             *(("details", details, name, by_shares) for name in ("select", "fraction", "threshold", "budget_mb")),
@@ -173,11 +176,12 @@ class Bytewise(TwoStages):
                 f"already: set it so, or lower base_degree; got {self.view_dependence_share}"
             )
         shares = {"view_dependence": self.view_dependence_share, "details": self.texture_share}
-        times = {
-            path: getattr(self, path).iterations(self.stage2_iterations) for path, share in shares.items() if share
-        }
-        for path, found in times.items():
-            if not found:
+        times = {}
+        for path, share in shares.items():
+            if share:
+                times[path] = getattr(self, path).iterations(self.stage2_iterations)
+        for path, iterations in times.items():
+            if not iterations:
                 raise ValueError(f"{path}.at must hold fractions at which its share of the bytes is spent; it is empty")
         if len(times) == 2 and times["view_dependence"][-1] > times["details"][0]:
             raise ValueError(

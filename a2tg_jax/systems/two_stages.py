@@ -64,12 +64,13 @@ class TwoStages(System):
         name: str = "gaussians",
     ) -> Stage:
         """Return a first stage, in which the degree of spherical harmonics rises and floaters are pruned."""
-        floaters, length = self.floaters, self.stage1_iterations
+        floaters = self.floaters
+        length = self.stage1_iterations
         if floaters.min_views or floaters.near:
-            growing = (each for each in events if isinstance(each, StepEvent) and each.most_gaussians is not None)
-            times = [found for each in growing if (found := each.times(length)).num_times]
-            if times:
-                last = max(times, key=lambda found: found.last_time)
+            growing = [event for event in events if isinstance(event, StepEvent) and event.most_gaussians is not None]
+            growths = [times for times in (event.times(length) for event in growing) if times.num_times]
+            if growths:
+                last = max(growths, key=lambda times: times.last_time)
                 floaters = dataclasses.replace(floaters, at=during_growth(floaters.at, length, last))
                 if not floaters.at:
                     raise ValueError(
@@ -87,7 +88,8 @@ class TwoStages(System):
         self, name: str, appearance: Appearance, events: tuple[Event, ...] = (), appearance_rate: object = None
     ) -> Stage:
         """Return a second stage, from the result of the first, with all degrees and a fixed number of Gaussians."""
-        losses, length = self.loss.terms(is_first=False), self.stage2_iterations
+        losses = self.loss.terms(is_first=False)
+        length = self.stage2_iterations
         return Stage(name, appearance, events, losses, self.rates, length, appearance_rate, self.corrections_of(1))
 
     def continued(self, first: Stage) -> tuple[Stage, ...]:
@@ -111,7 +113,8 @@ class LimitExponents(StepEvent):
         check_number("least", self.least, least=0, most=1)
 
     def apply(self, now: Now, model: Model, moments: AdamState, state: tuple[()]) -> Change:
-        if (shapes := model.appearance.shapes) is None:
+        shapes = model.appearance.shapes
+        if shapes is None:
             raise ValueError("LimitExponents needs kernels with exponents, such as Appearance(exponents=Exponents())")
         share = jnp.log(jnp.asarray(self.least, shapes.dtype)) / LARGEST_LOG_EXPONENT
         least = jnp.arctanh(jnp.clip(share, -MOST_SHARE, MOST_SHARE))

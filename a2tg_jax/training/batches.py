@@ -121,7 +121,8 @@ class BatchPlan(NamedTuple):
 
 def plan_batches(views: tuple[View, ...], batch_size: int, room: float | None = None, *, has_depths: bool) -> BatchPlan:
     """Return where photographs are during training. Arguments as of `PhotoStore`."""
-    sizes, of_rays = [view_bytes(view, has_depths=has_depths) for view in views], ray_bytes(views)
+    sizes = [view_bytes(view, has_depths=has_depths) for view in views]
+    of_rays = ray_bytes(views)
     room = device_room() if room is None else room
     batch_bytes = batch_size * max(sizes)
     num_ahead = max(1, min(MOST_AHEAD, int(ROOM_AHEAD // max(batch_bytes, 1))))
@@ -156,10 +157,14 @@ class PhotoStore:
         has_depths: whether depth maps are loaded with the photographs.
         room: largest number of bytes on the device; None: `DEVICE_SHARE` of its memory.
         """
-        self._views, self._order, self._last, self._mesh = views, order, last, mesh
+        self._views = views
+        self._order = order
+        self._last = last
+        self._mesh = mesh
         self._has_depths = has_depths
         plan = plan_batches(views, len(order.indices(1)), room, has_depths=has_depths)
-        self._keeps_rays, self.num_ahead = plan.keeps_rays, plan.num_ahead
+        self._keeps_rays = plan.keeps_rays
+        self.num_ahead = plan.num_ahead
         self._rays: dict[Kind, Array] = {}
         self._stacks: dict[Kind, Photographs] = {}
         self._of_kind: dict[Kind, list[int]] = {}

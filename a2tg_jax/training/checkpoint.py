@@ -53,7 +53,8 @@ class History(NamedFields):
 
     @staticmethod
     def empty() -> "History":
-        counts, values = np.zeros(0, np.int64), np.zeros(0)
+        counts = np.zeros(0, np.int64)
+        values = np.zeros(0)
         return History(counts, counts, values, values, counts, values, values)
 
     def __repr__(self) -> str:
@@ -172,7 +173,8 @@ def save_checkpoint(path: str | os.PathLike[str], checkpoint: Checkpoint) -> Non
       path: the file; an older one is replaced once the new one is complete.
       checkpoint: from `fit`, by `on_checkpoint`.
     """
-    state, model = checkpoint.state, checkpoint.state.model
+    state = checkpoint.state
+    model = checkpoint.state.model
     header = {
         "system": system_to_dict(checkpoint.system),
         "stage": checkpoint.stage,
@@ -216,7 +218,9 @@ def load_checkpoint(path: str | os.PathLike[str], system: type[System] | None = 
 
 def _checkpoint_of(header: dict[str, Any], arrays: dict[str, np.ndarray], options: System) -> Checkpoint:
     options.check()
-    stages, index, is_ahead = options.all_stages(), header["stage"], header["is_ahead"]
+    stages = options.all_stages()
+    index = header["stage"]
+    is_ahead = header["is_ahead"]
     if type(index) is not int or not 0 <= index < len(stages):  # bool is an int
         raise ValueError(f"stage must be a number in 0..{len(stages) - 1}; got {shortened(repr(index))}")
     stage = stages[index]
@@ -303,7 +307,8 @@ def check_state(state: TrainState, wanted: TrainState, stage: Stage) -> None:
     check_finite("state.moments.mu", state.moments.mu)
     check_finite("state.moments.nu", state.moments.nu, is_signed=False)
     # Only the number of names matters for shapes.
-    names, dtype = [""] * len(state.corrections[0].rows) if state.corrections else [], state.model.gaussians.means.dtype
+    names = [""] * len(state.corrections[0].rows) if state.corrections else []
+    dtype = state.model.gaussians.means.dtype
     neutral = jax.eval_shape(lambda: initial_corrections(stage.corrections, names, None, dtype))
     check_like("state.corrections", state.corrections, neutral)
     for known in state.corrections:
@@ -348,8 +353,11 @@ def check_resume(resume: Checkpoint, system: System, index: int) -> None:
             )
     if resume.system == dataclasses.replace(system, more=system.more[: len(resume.system.more)]):
         return
-    before, now, advice = type(resume.system), type(system), ""
-    values, others = flatten_config(resume.system), flatten_config(system)
+    before = type(resume.system)
+    now = type(system)
+    advice = ""
+    values = flatten_config(resume.system)
+    others = flatten_config(system)
     if before is now:
         pairs = {name: (values[name], others[name]) for name in values if values[name] != others[name]}
         differing = ", ".join(f"{name} {value!r}, not {other!r}" for name, (value, other) in pairs.items())

@@ -158,7 +158,8 @@ def initial_corrections(
     the stage starts from, where it has them, and neutral ones."""
     states = []
     for correction in corrections:
-        neutral, known = correction.neutral, {}
+        neutral = correction.neutral
+        known = {}
         if origin is not None and correction.name in origin.corrections:
             known = dict(zip(origin.names, origin.corrections[correction.name], strict=True))
         # By name, because the earlier training may have had other views.
@@ -191,7 +192,8 @@ def corrected_camera(corrections: Sequence[Correction], rows: Sequence[Array], c
       ValueError: naming the correction, if it returns something else than a camera of the same size.
     """
     for correction, row in zip(corrections, rows, strict=True):
-        before, camera = camera, correction.camera(row, camera)
+        before = camera
+        camera = correction.camera(row, camera)
         check_kept(f"{type(correction).__name__}.camera", camera, before)
     return camera
 
@@ -203,7 +205,8 @@ def corrected_color(corrections: Sequence[Correction], rows: Sequence[Array], co
       ValueError: naming the correction, if it returns something else than colours of the same shape.
     """
     for correction, row in zip(corrections, rows, strict=True):
-        before, color = color, correction.color(row, color)
+        before = color
+        color = correction.color(row, color)
         check_kept(f"{type(correction).__name__}.color", color, before)
     return color
 
@@ -335,7 +338,8 @@ def sliced(grid: Array, color: Array) -> Array:
         places = (jnp.arange(side, dtype=grid.dtype) + 0.5) / side * (num - 1)
         return jnp.maximum(1 - jnp.abs(places[:, None] - jnp.arange(num, dtype=grid.dtype)[None]), 0)
 
-    along_y, along_x = hats(rows, height), hats(columns, width)
+    along_y = hats(rows, height)
+    along_x = hats(columns, width)
     # Renders may leave [0, 1], where the outer levels continue.
     luminance = jnp.clip(color @ jnp.asarray(LUMINANCE, color.dtype), 0, 1) * (levels - 1)
 

@@ -111,14 +111,18 @@ def forecast_stages(
     mean_pixels = sum(view.camera.width * view.camera.height for view in scene.train) / len(scene.train)
     num = initial_number(scene, system, stages[0]) if num_start is None else num_start
     stages = stages[first:]
-    floats, shared, shown = 0.0, 0, None
+    floats = 0.0
+    shared = 0
+    shown = None
     if num_given is not None:
-        num, stages = num_given, stages[1:]
+        num = num_given
+        stages = stages[1:]
         yield StageForecast(Bytes(), system.initial_bytes * num, num, num_programs=0, seconds=0, whole_bytes=0)
     for stage in stages:
         num = rows_needed(stage, num, system)
         if stage.appearance != shown:
-            floats, shown = stage.floats_shown(system.initial_sh_degree), stage.appearance
+            floats = stage.floats_shown(system.initial_sh_degree)
+            shown = stage.appearance
             shared = stage.shared_bytes
         own = floats_per_gaussian(system.initial_sh_degree) + floats
         model_bytes = BYTES_PER_FLOAT * own * num + shared
@@ -179,7 +183,8 @@ def stage_bytes(
     Each of several devices has its share of the state, and, while it draws its views, a copy of the model.
     """
     is_changed = any(isinstance(event, HostEvent) and event.iterations(stage.iterations) for event in stage.events)
-    largest, batch = largest_view(scene.train), system.batch_size // num_devices
+    largest = largest_view(scene.train)
+    batch = system.batch_size // num_devices
     per_view = sum(BYTES_PER_FLOAT * correction.neutral.size for correction in stage.corrections)
     per_pixel = STEP_PER_PIXEL + GEOMETRY_PER_PIXEL * stage.has_geometry
     pairs = PAIRS_PER_TILE * largest / system.tile_size**2

@@ -35,7 +35,8 @@ def what_diverged(tried: Attempt, names: Sequence[str]) -> str:
     losses = np.asarray(tried.views.loss)
     found = [f"the loss of {name} is {loss}" for name, loss in zip(names, losses, strict=True) if not np.isfinite(loss)]
     found += [f"the gradient by {place}" for place in _not_finite(tried.grads)]
-    model, corrections = tried.state.model, tuple(known.rows for known in tried.state.corrections)
+    model = tried.state.model
+    corrections = tuple(known.rows for known in tried.state.corrections)
     found += [f"after the step, {place}" for place in _not_finite((model.gaussians, model.appearance, corrections))]
     return "; ".join(found) or f"the loss of {', '.join(names)} is {np.mean(losses):.4g}"
 

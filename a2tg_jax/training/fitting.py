@@ -220,9 +220,11 @@ def _check_arguments(
         example = f"use {path}_scene()" if path in BUILT_IN else f"use load_scene({path!r})"
     check_kind("scene", scene, Scene, example)
     if not isinstance(system, System):
-        found, example = kind_of(system), ""
+        found = kind_of(system)
+        example = ""
         if isinstance(system, str):
-            found, example = "a name", f": use find_system({shortened(system)!r}).preset('quick')"
+            found = "a name"
+            example = f": use find_system({shortened(system)!r}).preset('quick')"
         elif isinstance(system, type) and issubclass(system, System):
             example = f": use {system.__name__}() or {system.__name__}.preset('quick')"
         raise ValueError(f"system must be a System; got {found}{example}")
@@ -327,7 +329,8 @@ def _result_of(run: StageRun, scene: Scene, *, is_last: bool) -> StageResult:
 
 def warn_of_budget(system: System, model: Model) -> None:
     """Warn if a finished model does not fill its memory budget or exceeds it."""
-    budget, used = system.budget_bytes, model.num_bytes
+    budget = system.budget_bytes
+    used = model.num_bytes
     one = (used - model.bytes_of(0)) / model.num
     if budget is None or budget * (1 - LARGEST_SHORTFALL) <= used <= budget:
         return

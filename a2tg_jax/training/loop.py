@@ -163,7 +163,9 @@ class StageRun:
         self.session = session or Session()
         self.mesh = self.session.mesh
         check_batch_size(system.batch_size, self.session.num_devices)
-        self.views, self.system, self.index = scene.train, system, index
+        self.views = scene.train
+        self.system = system
+        self.index = index
         self._recorded_views = RecordedViews.of(scene.train)
         stages = system.all_stages()
         self.stage = stages[index]
@@ -187,7 +189,8 @@ class StageRun:
             check_corrections(resume.state.corrections, len(self.views))
             if resume.views is not None:
                 resume.views.check(self.views)
-            num, num_devices = resume.state.model.gaussians.num, self.session.num_devices
+            num = resume.state.model.gaussians.num
+            num_devices = self.session.num_devices
             if num % num_devices:
                 warnings.warn(
                     f"the checkpoint has {num:,} rows, which {num_devices} devices cannot share evenly: each holds all "
@@ -220,14 +223,17 @@ class StageRun:
 
     def _with_room(self, state: TrainState) -> TrainState:
         """Return the state, padded for what events will add between steps, so that no step is compiled again."""
-        model, moments = state.model, state.moments
-        num, num_bytes = model.num, float(model.num_bytes)
+        model = state.model
+        moments = state.moments
+        num = model.num
+        num_bytes = float(model.num_bytes)
         for event, own in zip(self.stage.events, state.events, strict=True):
             if isinstance(event, HostEvent) and own is not None:
                 with calling(event, "with_room", self.stage.name):
                     found = Change(*event.with_room(model, moments, num_bytes, self.stage.iterations), own)
                     found = checked_change(found)
-                model, moments = found.model, found.moments
+                model = found.model
+                moments = found.moments
             num_bytes = event.most_bytes(num_bytes, num, self.stage.iterations)
         return dataclasses.replace(state, model=model, moments=moments)
 
@@ -272,7 +278,8 @@ class StageRun:
         """Run the stage to its end, then release its photographs. If it is stopped, write a last checkpoint and raise
         `Interrupted`.
         """
-        iteration, end = int(self.state.iteration), self.stage.iterations
+        iteration = int(self.state.iteration)
+        end = self.stage.iterations
         self.effects.warn_of_never()
         # Several processes launch the same steps, and stop together.
         stops_launching = is_stopped if num_processes(self.mesh) == 1 else never
@@ -345,8 +352,10 @@ class StageRun:
         return taken
 
     def _launch(self, iteration: int) -> StepInfo:
-        arguments, step = self.arguments(iteration), jitted_step()
-        before, started = num_compiled(step), time.perf_counter()
+        arguments = self.arguments(iteration)
+        step = jitted_step()
+        before = num_compiled(step)
+        started = time.perf_counter()
         info: StepInfo
         self.state, info = step(*arguments)
         is_compiled = num_compiled(step) > before
@@ -359,7 +368,8 @@ class StageRun:
     def arguments(self, iteration: int) -> tuple[Any, ...]:
         """Return the arguments of the step of an iteration."""
         photographs, views = self.photographs.batch(iteration)
-        render, due = self.render_settings(self._size(iteration)), None
+        render = self.render_settings(self._size(iteration))
+        due = None
         if are_events_decided_by_host(self.state):
             due = tuple(times is None or bool(times.is_due(iteration)) for times in self.clock.times)
         settings = StepSettings(render, self.system.background, due, self.mesh)
@@ -373,9 +383,11 @@ class StageRun:
     def render_settings(self, size: Size) -> RenderSettings:
         """Return settings with room for the views of a size, planned before the first of them for a sample of the views
         and for all rows of the model to exist."""
-        settings, model = RenderSettings(tile_size=self.system.tile_size), self.state.model
+        settings = RenderSettings(tile_size=self.system.tile_size)
+        model = self.state.model
         if size not in self.capacities:
-            dtype, appearance = model.gaussians.means.dtype, model.appearance
+            dtype = model.gaussians.means.dtype
+            appearance = model.appearance
             views = [view for view in self.views if view.picture.size == size]
             sample = evenly_chosen(views, PLANNED_VIEWS)
             cameras = [jax.tree.map(lambda x: jnp.asarray(x, dtype), view.camera) for view in sample]

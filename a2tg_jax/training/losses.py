@@ -51,7 +51,8 @@ def photometric_loss(image: Array, target: Array, *, ssim_weight: float | Array 
 
 def photometric_parts(image: Array, target: Array, *, ssim_weight: float | Array = 0.2) -> dict[str, Array]:
     """Return the summands of `photometric_loss`, weighted, as "l1" and "ssim"; without "ssim" if its weight is 0."""
-    image, target = plain_array("image", image), plain_array("target", target)
+    image = plain_array("image", image)
+    target = plain_array("target", target)
     check_same_shape(image, target)
     l1 = jnp.mean(jnp.abs(image - target))
     if not isinstance(ssim_weight, Array):
@@ -69,20 +70,23 @@ def mean_ssim(image: Array, target: Array) -> Array:
 
     Both images are [H, W, 3]. ValueError: if their shapes differ or a side is shorter than the window.
     """
-    image, target = plain_array("image", image), plain_array("target", target)
+    image = plain_array("image", image)
+    target = plain_array("target", target)
     check_same_shape(image, target)
     if min(image.shape[:2]) < SSIM_WINDOW:
         raise ValueError(
             f"SSIM needs images of at least {SSIM_WINDOW} by {SSIM_WINDOW} pixels; got {image.shape[1]} by "
             f"{image.shape[0]}: use larger images or ssim_weight=0"
         )
-    x, y = jnp.moveaxis(image, -1, 0), jnp.moveaxis(target, -1, 0)
+    x = jnp.moveaxis(image, -1, 0)
+    y = jnp.moveaxis(target, -1, 0)
     return window_scores.mean_score(window_scores.Score(_similarity, SSIM_TAPS), x, y)
 
 
 def _similarity(mean_x: Array, mean_y: Array, mean_squares: Array, mean_product: Array) -> Array:
     """SSIM of a window, from its means of x, y, x² + y² and x·y; element-wise."""
-    means_product, means_squares = mean_x * mean_y, mean_x * mean_x + mean_y * mean_y
+    means_product = mean_x * mean_y
+    means_squares = mean_x * mean_x + mean_y * mean_y
     # E(x·y) − E(x)·E(y) is the covariance; of the squares, the sum of both variances.
     luminance = (2 * means_product + SSIM_C1) / (means_squares + SSIM_C1)
     structure = (2 * (mean_product - means_product) + SSIM_C2) / (mean_squares - means_squares + SSIM_C2)

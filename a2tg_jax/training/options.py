@@ -69,7 +69,8 @@ class LossConfig(NamedFields):
         """
         first: LossTerm = Photometric(self.ssim_weight) if self.ssim_weight else Term(l1)
         if self.robust_share:
-            start, has_ssim = RobustPhotometric.start if is_first else 0.0, self.ssim_weight != 0
+            start = RobustPhotometric.start if is_first else 0.0
+            has_ssim = self.ssim_weight != 0
             first = RobustPhotometric(self.ssim_weight, self.robust_share, self.robust_factor, start, has_ssim)
         optional: tuple[Term | DepthPrior, ...] = (
             Term(normals, self.normal_weight, has_geometry=True),
@@ -421,7 +422,8 @@ def like(kind: Any, other: object) -> Any:
     hints, other_hints = (typing.get_type_hints(type(config)) for config in (value, other))
     changes = {}
     for field in dataclasses.fields(value):
-        own, others = getattr(value, field.name), getattr(other, field.name, None)
+        own = getattr(value, field.name)
+        others = getattr(other, field.name, None)
         if dataclasses.is_dataclass(own) and dataclasses.is_dataclass(others):
             changes[field.name] = like(own, others)
         # The same name with another type means something else.
@@ -436,7 +438,8 @@ def own_options(system: object, other: object) -> dict[str, Any]:
     hints, other_hints = (typing.get_type_hints(type(config)) for config in (system, other))
     found: dict[str, Any] = {}
     for name, option in config_to_dict(system).items():
-        own, others = getattr(system, name), getattr(other, name, None)
+        own = getattr(system, name)
+        others = getattr(other, name, None)
         if dataclasses.is_dataclass(own) and dataclasses.is_dataclass(others):
             inner = own_options(own, others)
             found |= {name: inner} if inner else {}

@@ -91,7 +91,8 @@ def system_from_dict(data: Mapping[str, Any], where: str, kind: type[System] | N
     """
     if not isinstance(data, Mapping) or not isinstance(data.get("name"), str) or "options" not in data:
         raise ValueError(f"{where}: does not name its system; it is damaged or of another version")
-    name, options = data["name"], data["options"]
+    name = data["name"]
+    options = data["options"]
     if kind is None and name in SYSTEMS:
         kind = type(find_system(name))
     if kind is None:

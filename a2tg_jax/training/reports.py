@@ -51,11 +51,16 @@ class Pace:
     ):  # fmt: skip
         """`first` iterations were done before, `total` is the last one, and `now` is a clock in seconds. Gaussians grow
         to at most `most_gaussians`; 0: they do not."""
-        self._total, self._now, self._most, self._after = total, now, most_gaussians, after
+        self._total = total
+        self._now = now
+        self._most = most_gaussians
+        self._after = after
         self._due = [first, (first + total) // 2]
         self._before: tuple[int, float, int] | None = None
-        self._steps, self._seconds = 0, 0.0
-        self._ahead, self._seconds_a_program = 0, 0.0
+        self._steps = 0
+        self._seconds = 0.0
+        self._ahead = 0
+        self._seconds_a_program = 0.0
 
     def time(self, done: int, num_compiled: int, ahead: int = 0, seconds_a_program: float = 0.0) -> None:
         """Time the iterations since the last call, unless programs were compiled meanwhile.
@@ -63,7 +68,8 @@ class Pace:
         Numbers of iterations and compiled programs are totals so far; `ahead` is about how many will be compiled.
         """
         now = self._now()
-        self._ahead, self._seconds_a_program = ahead, seconds_a_program
+        self._ahead = ahead
+        self._seconds_a_program = seconds_a_program
         if self._before is not None and self._before[2] == num_compiled:
             self._steps += done - self._before[0]
             self._seconds += now - self._before[1]
@@ -79,7 +85,8 @@ class Pace:
         compiling = f", with {counted(self._ahead, 'program')} to compile" if self._ahead else ""
         pace = f"{1e3 * self._seconds / self._steps:,.0f} ms an iteration"
         self._due = [due for due in self._due[1:] if due > done]
-        self._steps, self._seconds = 0, 0.0
+        self._steps = 0
+        self._seconds = 0.0
         return f"{pace}, about {left} left{compiling}{growing}"
 
     def left(self, done: int) -> datetime.timedelta | None:
@@ -103,9 +110,12 @@ class ProgressBar:
             desc=f"{title} (compiling)", initial=done, total=total, disable=not is_bar, unit="it",
             dynamic_ncols=True, mininterval=0.5, bar_format=BAR,
         )  # fmt: skip
-        self._title, self._done, self._total = title, done, total
+        self._title = title
+        self._done = done
+        self._total = total
         self._pace = Pace(done, total, most_gaussians=most_gaussians, after=after)
-        self._is_shown, self._is_plain = is_shown, is_shown and not is_bar
+        self._is_shown = is_shown
+        self._is_plain = is_shown and not is_bar
         self._last_line = done, time.perf_counter()
         self._loss: float | None = None
         self._psnr = 0.0
@@ -131,9 +141,11 @@ class ProgressBar:
 
     def update(self, info: StepInfo, row: Mapping[str, float] | None) -> None:
         """Count one iteration; loss and PSNR are running means. `row` is the last one of the history."""
-        loss, psnr = float(info.loss), float(info.psnr)
+        loss = float(info.loss)
+        psnr = float(info.psnr)
         if self._loss is None:
-            self._loss, self._psnr = loss, psnr
+            self._loss = loss
+            self._psnr = psnr
             self._bar.set_description_str(self._title)
         self._loss += (1 - MOMENTUM) * (loss - self._loss)
         self._psnr += (1 - MOMENTUM) * (psnr - self._psnr)
@@ -181,7 +193,9 @@ class LearningCheck:
         small_budget: str = "",
     ):  # fmt: skip
         """Only the first stage (`is_first`) is checked. `small_budget` is what a small memory budget has room for."""
-        self._views, self._order, self._level = views, order, FLAT_BACKGROUNDS[background]
+        self._views = views
+        self._order = order
+        self._level = FLAT_BACKGROUNDS[background]
         self._advice = f"{small_budget}: raise it" if small_budget else ADVICE
         at = max(round(CHECKED_AFTER * iterations), LEAST_ITERATIONS)
         self._at = at if is_first and at <= iterations else 0
@@ -193,7 +207,8 @@ class LearningCheck:
             self._seen.append((iteration, psnr))
         if iteration != self._at:
             return
-        reached, flat = float(np.mean([psnr for _, psnr in self._seen])), []
+        reached = float(np.mean([psnr for _, psnr in self._seen]))
+        flat = []
         # Flat colours of the same views, because some are easier than others.
         for iteration, _ in self._seen:
             for view in (self._views[index] for index in self._order.indices(iteration)):
@@ -246,12 +261,15 @@ class StageEffects:
 
     def __init__(self, stage: Stage, system: System, num_sizes: int):
         """The system names the options in messages; each image size has a program."""
-        self._stage, self._system, self._num_sizes = stage, system, num_sizes
+        self._stage = stage
+        self._system = system
+        self._num_sizes = num_sizes
         self._on_host: dict[int, tuple[HostEvent, Effects]] = {
             place: (event, Effects()) for place, event in enumerate(stage.events) if isinstance(event, HostEvent)
         }
         self._reshaped_by: list[int] = []
-        self._num_compiled, self._seconds = 0, 0.0
+        self._num_compiled = 0
+        self._seconds = 0.0
 
     def apply(self, place: int, state: TrainState, change: Change) -> None:
         """Record a change of the state by the event at an index."""
@@ -274,10 +292,12 @@ class StageEffects:
     def launch(self, iteration: int, seconds: float | None) -> None:
         """Record a step that was launched, and the seconds that its compilation took, if any. Warn if an event is why
         steps are compiled again and again."""
-        reshaped_by, self._reshaped_by = self._reshaped_by, []
+        reshaped_by = self._reshaped_by
+        self._reshaped_by = []
         if seconds is None:
             return
-        self._num_compiled, self._seconds = self._num_compiled + 1, self._seconds + seconds
+        self._num_compiled = self._num_compiled + 1
+        self._seconds = self._seconds + seconds
         for place in dict.fromkeys(reshaped_by):
             event, own = self._on_host[place]
             own.num_compiled += 1

@@ -42,7 +42,9 @@ GREY, GREY_SLACK = 0.5, 0.01
 def initial_model(scene: Scene, system: System) -> Model:
     """Return Gaussians at the scene's points, as many as the first stage has room for."""
     first = system.stages()[0]
-    num, degree, opacity = initial_number(scene, system, first), system.initial_sh_degree, system.initial_opacity
+    num = initial_number(scene, system, first)
+    degree = system.initial_sh_degree
+    opacity = system.initial_opacity
     gaussians = init_from_points(scene.points, start_colors(scene), num, system.seed, opacity=opacity, sh_degree=degree)
     adapted = fainter_where_dense if first.appearance.has_low_pass else wider_where_dense
     return Model(adapted(gaussians, [view.camera for view in scene.train]))
@@ -95,10 +97,12 @@ def fainter_where_dense(gaussians: Gaussians, cameras: Sequence[Camera]) -> Gaus
 
 def _largest_sizes(gaussians: Gaussians, cameras: Sequence[Camera]) -> np.ndarray:
     """Return the smaller standard deviation of Gaussians in pixels [N], from the camera where it is largest."""
-    means, scales = np.asarray(gaussians.means, np.float64), np.asarray(gaussians.scales, np.float64)
+    means = np.asarray(gaussians.means, np.float64)
+    scales = np.asarray(gaussians.scales, np.float64)
     largest = np.zeros(len(means))
     for camera in cameras:
-        viewmat, K = np.asarray(camera.viewmat, np.float64), np.asarray(camera.K, np.float64)
+        viewmat = np.asarray(camera.viewmat, np.float64)
+        K = np.asarray(camera.K, np.float64)
         largest = np.maximum(largest, pixel_sizes(means, scales, viewmat, K))
     return largest
 
@@ -256,7 +260,9 @@ def rows_needed(stage: Stage, num: int, system: System) -> int:
         try:
             rows = max(rows, event.num_rows(num, stage.iterations))
         except ValueError as error:
-            reason, field, limit = str(error), event.limited_by, _limit_of(event, system)
+            reason = str(error)
+            field = event.limited_by
+            limit = _limit_of(event, system)
             if not (field and reason.startswith(field)):
                 raise ValueError(f"{system.path_of(event)}: {reason}") from error
             reason = limit + reason.removeprefix(field)
@@ -280,7 +286,9 @@ def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> 
     takes the nearest Gaussians, with a warning. The number of devices divides the number of rows. ValueError: if
     Gaussians would be added to a model whose textures have grown.
     """
-    gaussians, shapes, num = model.gaussians, model.appearance.shapes, model.gaussians.num
+    gaussians = model.gaussians
+    shapes = model.appearance.shapes
+    num = model.gaussians.num
     for event in stage.events:
         most = event.most_gaussians
         if most is not None and num > most:
@@ -320,7 +328,8 @@ def _kept_fields(before: Appearance, allocated: Appearance, stage: Stage) -> dic
     kept: dict[str, Any] = {}
     for field in dataclasses.fields(allocated):
         name = field.name
-        old, new = getattr(before, name, None), getattr(allocated, name)
+        old = getattr(before, name, None)
+        new = getattr(allocated, name)
         if old is None or new is None or field.metadata.get("static"):
             continue
         if is_same or (isinstance(old, Part) and _options(old) == _options(new)):

@@ -194,7 +194,8 @@ def attempt(
     views: Array | None, scene_scale: Array, key: Array, rows: Array | None = None,
 ) -> Attempt:  # fmt: skip
     """Return the outcome of one iteration. Same arguments as `train_step`; none is donated."""
-    iteration, model = state.iteration + 1, state.model
+    iteration = state.iteration + 1
+    model = state.model
     num_keys = sum(event.num_keys for event in stage.events if isinstance(event, StepEvent))
     # By iteration, so that repeated and resumed steps draw the same numbers.
     keys = jax.random.split(jax.random.fold_in(key, iteration), 1 + num_keys)
@@ -341,12 +342,15 @@ def _events(
 ) -> tuple[Change, tuple[Any, ...]]:  # fmt: skip
     """Gather statistics for the events, and apply those inside the step, which must keep all shapes."""
     nothing = EventInfo(jnp.asarray(True), jnp.zeros((), jnp.int32))
-    infos, left, at = nothing, [], 0
+    infos = nothing
+    left = []
+    at = 0
     known = due or (None,) * len(stage.events)
     for event, times, state, is_due in zip(stage.events, clock.times, states, known, strict=True):
         name = f"stage {stage.name!r}: {type(event).__name__}"
         if state is not None and event.observes:
-            before, state = state, event.observe(state, model, seen)
+            before = state
+            state = event.observe(state, model, seen)
             check_kept(f"{name}.observe", state, before)
         if isinstance(event, StepEvent):
             own = now._replace(keys=now.keys[at : at + event.num_keys], times=times)
@@ -362,7 +366,8 @@ def _events(
                 info = EventInfo(jnp.asarray(is_possible), jnp.asarray(num_refused, jnp.int32))
                 return change.model, change.moments, change.state, info
 
-            carry, info = (model, moments, state), nothing
+            carry = (model, moments, state)
+            info = nothing
             if times is None or (is_due and state is not None):  # The state of an event that is past is None.
                 model, moments, state, info = apply(carry)
             elif is_due is None and state is not None:  # The step itself decides.

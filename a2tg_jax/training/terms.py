@@ -177,9 +177,11 @@ def inliers(residual: Array, share: Array | float, factor: Array | float, mask: 
 
     def sums_around(image: Array) -> Array:
         # Sums over square patches, which the right and lower edges may cut off; then over each one's neighbours.
-        zero, padding = jnp.zeros((), image.dtype), ((0, -height % side), (0, -width % side))
+        zero = jnp.zeros((), image.dtype)
+        padding = ((0, -height % side), (0, -width % side))
         patches = jax.lax.reduce_window(image, zero, jax.lax.add, (side, side), (side, side), padding)
-        around, reach = (2 * REACH + 1,) * 2, ((REACH, REACH),) * 2
+        around = (2 * REACH + 1,) * 2
+        reach = ((REACH, REACH),) * 2
         return jax.lax.reduce_window(patches, zero, jax.lax.add, around, (1, 1), reach)
 
     sums, nums = (sums_around(x) for x in (jax.lax.stop_gradient(residual) * counts, counts))

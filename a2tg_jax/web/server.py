@@ -19,7 +19,8 @@ from typing import Any
 from a2tg_jax.host import signals
 from a2tg_jax.host.optional import optional
 
-LOOPBACK, ANY = "127.0.0.1", "0.0.0.0"
+LOOPBACK = "127.0.0.1"
+ANY = "0.0.0.0"
 ELSEWHERE = "192.0.2.1"
 """Address that no machine has (RFC 5737)."""
 MOST_BODY_BYTES = 1 << 16
@@ -120,7 +121,8 @@ def application(routes: Mapping[str, Route], door: Door) -> Application:
         path = door.behind(environ["PATH_INFO"] or "/")
         if path is None or not door.admits(environ.get("HTTP_HOST") or ""):
             return refuse("403 Forbidden")
-        route, method = routes.get(path), environ["REQUEST_METHOD"]
+        route = routes.get(path)
+        method = environ["REQUEST_METHOD"]
         act = None if route is None else route.act
         if method not in (("GET", "HEAD") if act is None else ("POST",)):
             return refuse("405 Method Not Allowed")
@@ -200,9 +202,11 @@ def _running(routes: Mapping[str, Route], host: str, port: int) -> Iterator[tupl
             raise OverflowError("ports are 0 to 65535")
         listening = socket.create_server((host, port))  # SO_REUSEADDR: a port freed a moment ago may be reused.
     except (OSError, OverflowError, UnicodeError) as error:
-        place, remedy = f"port {port}", "leave out --port for a free one"
+        place = f"port {port}"
+        remedy = "leave out --port for a free one"
         if host != LOOPBACK:
-            place, remedy = f"{host}:{port}", "--host takes an IPv4 address of this machine, or 0.0.0.0"
+            place = f"{host}:{port}"
+            remedy = "--host takes an IPv4 address of this machine, or 0.0.0.0"
         raise ValueError(f"{place} cannot be used: {getattr(error, 'strerror', None) or error}; {remedy}") from error
     address, port = listening.getsockname()
     is_private = ipaddress.IPv4Address(address).is_loopback

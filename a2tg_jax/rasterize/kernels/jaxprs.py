@@ -56,7 +56,8 @@ def trace(function: Callable[..., object], *examples: object) -> tuple[core.Clos
 def in_clean_context(work: Callable[[], object]) -> Any:
     """Return work(), run on a thread of its own, because JAX's tracing is per thread, with the caller's dtype rules."""
     config: Any = jax.config
-    is_x64, promotion = config.jax_enable_x64, config.jax_numpy_dtype_promotion
+    is_x64 = config.jax_enable_x64
+    promotion = config.jax_numpy_dtype_promotion
 
     def with_rules() -> Any:
         with jax.enable_x64(is_x64), jax.numpy_dtype_promotion(promotion):
@@ -69,7 +70,9 @@ def in_clean_context(work: Callable[[], object]) -> Any:
 
 def _whole_power(x: Array, y: int) -> Array:
     """Return x^y by repeated squaring: bits of |y| from the lowest on, as the power runs through x, x², x⁴, …"""
-    power, left, result = x, abs(y), None
+    power = x
+    left = abs(y)
+    result = None
     while left:
         if left & 1:
             result = power if result is None else result * power
@@ -124,7 +127,8 @@ def make_code(
         return literal(number, atom.aval.dtype)
 
     for equation in inner.eqns:
-        name, operands = equation.primitive.name, [read(atom) for atom in equation.invars]
+        name = equation.primitive.name
+        operands = [read(atom) for atom in equation.invars]
         if name in CALLS:
             called = equation.params["jaxpr"] if "jaxpr" in equation.params else equation.params["call_jaxpr"]
             results = make_code(called, operands, literal, primitives, target)
@@ -157,10 +161,14 @@ class PixelFunctions:
     """
 
     def __init__(self, settings: PassSettings):
-        self.settings, self._functions = settings, settings.static.functions
-        number, integer, flag = example(settings.dtype), example(jnp.int32), example(jnp.bool_)
+        self.settings = settings
+        self._functions = settings.static.functions
+        number = example(settings.dtype)
+        integer = example(jnp.int32)
+        flag = example(jnp.bool_)
         triple = (number,) * 3
-        normal, numbers = triple if settings.has_geometry else None, (number,) * settings.num_own_numbers
+        normal = triple if settings.has_geometry else None
+        numbers = (number,) * settings.num_own_numbers
         splat = pixel.Splat((triple,) * 3, number, (number,) * settings.num_colors, normal, numbers)
         values = (number,) * settings.num_columns
         region = TextureRegion(integer, integer, integer) if values else None
@@ -173,7 +181,8 @@ class PixelFunctions:
         planes = jax.tree.unflatten(structure, [number] * structure.num_leaves)
         self.prepare_vjp, _ = trace(_planes_vjp, splat.M, tile, planes)
         self.reach, _ = trace(self._reach, planes, region, number, number)
-        at_pixel, channels = (number, number, number, flag), (number,) * settings.num_channels
+        at_pixel = (number, number, number, flag)
+        channels = (number,) * settings.num_channels
         self.forward, _ = trace(self._forward, planes, splat, values, *at_pixel, channels)
         of_backward = number, channels, tile, (triple,) * 3
         self.backward, _ = trace(self._backward, planes, splat, lookup, *at_pixel, *of_backward)
@@ -200,7 +209,9 @@ class PixelFunctions:
         jacobian: pixel.Rows,
     ) -> tuple[pixel.State, Array, tuple[Array, ...], Any]:  # fmt: skip
         """Return the state behind the splat, whether it contributes, the cotangents of the values, and all others."""
-        near_plane, statistic, functions = self.settings.near_plane, self.settings.statistic, self._functions
+        near_plane = self.settings.near_plane
+        statistic = self.settings.statistic
+        functions = self._functions
         at_pixel = planes, splat, lookup, x, y, transmittance, is_live, suffix_sum, g
         state, weight, d = pixel.blend_vjp(functions, near_plane, *at_pixel, statistic is not None)
         added: tuple[Array, ...] = ()

@@ -94,7 +94,8 @@ def window_mean(images: Array, taps: tuple[float, ...]) -> Array:
 
 
 def _window_mean(images: Array, *, taps: tuple[float, ...]) -> Array:
-    num, half = len(taps), len(taps) // 2
+    num = len(taps)
+    half = len(taps) // 2
     # Along each axis a sum of shifted slices, which is faster than a convolution on CPUs.
     for axis in (images.ndim - 2, images.ndim - 1):
         size = images.shape[axis] - num + 1

@@ -72,8 +72,10 @@ def backward(
       g: [tiles, D, P] cotangents of the channels.
       suffix_sum: [tiles, P] B of the whole list (`rasterize.pixel.absorb_vjp`).
     """
-    on_blocks, splats = _TracedPass(settings, inputs), inputs.splats
-    size, groups = on_blocks.size, on_blocks.num_groups
+    on_blocks = _TracedPass(settings, inputs)
+    splats = inputs.splats
+    size = on_blocks.size
+    groups = on_blocks.num_groups
     widths = [math.prod(leaf.shape[1:]) for leaf in splats]
     # One row per splat: one scatter adds a block, where each field would need its own.
     packed = jnp.zeros((splats.M.shape[0], sum(widths)), splats.M.dtype)
@@ -83,7 +85,8 @@ def backward(
         x = jnp.pad(x, [(0, groups * size - x.shape[0]), *[(0, 0)] * (x.ndim - 1)])
         return x.reshape(groups, size, *x.shape[1:])
 
-    g, suffix_sum = grouped(g), grouped(suffix_sum)
+    g = grouped(g)
+    suffix_sum = grouped(suffix_sum)
 
     def group(index: Array, totals: tuple[Array, Array, Array]) -> Any:
         tiles, start = on_blocks.tiles_of_group(index)
@@ -117,7 +120,9 @@ class _TracedPass:
     """A pass over groups of tiles, block by block."""
 
     def __init__(self, settings: PassSettings, inputs: PassInputs, in_any_mode: bool = False):
-        self.settings, self.grid, self.in_any_mode = settings, settings.grid, in_any_mode
+        self.settings = settings
+        self.grid = settings.grid
+        self.in_any_mode = in_any_mode
         self.size = settings.tile_batch or self.grid.num
         self.num_groups = -(-self.grid.num // self.size)
         self.functions = elementwise_functions(settings.static, settings.arguments)
@@ -152,7 +157,9 @@ class _TracedPass:
 
     def tiles_of_group(self, index: Array) -> tuple[Tiles, Array]:
         """Return the tiles of a group, and the starts of their lists [G]; tiles past the last one have empty lists."""
-        grid, lists, size = self.grid, self.lists, self.grid.tile_size
+        grid = self.grid
+        lists = self.lists
+        size = self.grid.tile_size
         tile = index * self.size + jnp.arange(self.size, dtype=jnp.int32)
         x = (tile % grid.columns).astype(self.dtype) * size + size / 2
         y = (tile // grid.columns).astype(self.dtype) * size + size / 2
@@ -179,8 +186,12 @@ class _TracedPass:
         """Map a function of one tile over a leading axis of G tiles; a single one needs no vmap."""
         if self.size > 1:
             return jax.vmap(function)
-        take, put = (lambda x: x[0]), (lambda x: x[None])
-        return lambda *args: jax.tree.map(put, function(*jax.tree.map(take, args)))
+
+        def of_one(*args: Any) -> Any:
+            result = function(*jax.tree.map(lambda x: x[0], args))
+            return jax.tree.map(lambda x: x[None], result)
+
+        return of_one
 
     def block_ids(self, at: Array) -> Array:
         """Return the splats [G, B] of the blocks that start at `at` [G]."""
@@ -208,7 +219,8 @@ class _TracedPass:
 
     def spread(self, splats: Splats, tile: Tiles) -> tuple[pixel.Splat, pixel.Planes]:
         """Return the splats of a block and their planes as numbers for `pixel`, [B, P] each."""
-        splat, num = _split(splats, self.settings.has_geometry), self.settings.num_pixels
+        splat = _split(splats, self.settings.has_geometry)
+        num = self.settings.num_pixels
 
         def put(x: Array) -> Array:
             # `spread_to_pixels` has the faster gradient, in reverse mode only.

@@ -89,7 +89,8 @@ def _inputs() -> tuple[PassSettings, tuple[Any, ...]]:
         return rng.uniform(low, high, (*shape, NUM)).astype(np.float32).T
 
     x, y, depth, angle, u, v = draw(0, GRID.width), draw(0, GRID.height), *(draw(1, most) for most in (3, 4, 6, 6))
-    u_tilt, v_tilt = draw(-0.05, 0.05), draw(-0.05, 0.05)
+    u_tilt = draw(-0.05, 0.05)
+    v_tilt = draw(-0.05, 0.05)
     # Columns of M: the axes u and v of a splat of 1 to 6 pixels, slightly inclined, and its centre.
     rows = (
         (u * np.cos(angle) + x * u_tilt, -v * np.sin(angle) + x * v_tilt, x),
@@ -97,7 +98,8 @@ def _inputs() -> tuple[PassSettings, tuple[Any, ...]]:
         (u_tilt, v_tilt, np.ones_like(x)),
     )
     M: Any = np.moveaxis(depth * np.asarray(rows, np.float32), -1, 0)
-    normals, nothing = draw(-1, 1, 3), draw(0, 0, 0)
+    normals = draw(-1, 1, 3)
+    nothing = draw(0, 0, 0)
     splats = Splats(M, draw(0, 1, 3), draw(0.05, 0.6), normals, nothing)
     texels = draw(0.1, 0.9, 4, 4).reshape(-1, 4)
     # The kernels read textures of one texel in another way than larger ones.
@@ -107,5 +109,6 @@ def _inputs() -> tuple[PassSettings, tuple[Any, ...]]:
     static = StaticShading.of(Appearance(texture=Texture()))
     settings = PassSettings(static, 0, 4, 3, "float32", GRID, 0.2, True, "position", tile_batch=0)
     g = rng.normal(size=(GRID.num, settings.num_channels, settings.num_pixels)).astype(np.float32)
-    jacobian, probe = np.diag([40, 40, 1]).astype(np.float32), draw(0, 0, 4)
+    jacobian = np.diag([40, 40, 1]).astype(np.float32)
+    probe = draw(0, 0, 4)
     return settings, (splats, texels, regions, gaussian_cutoff(splats.opacities), jacobian, probe, g)

@@ -66,7 +66,8 @@ def launch(
     except RuntimeError:
         found = [DEFAULT_CAPABILITY]
     capability = min(found, key=lambda text: [int(part) for part in text.split(".")])
-    program, tile_size = nvrtc.ptx(source(kernel, "cuda"), capability), kernel.grid.tile_size
+    program = nvrtc.ptx(source(kernel, "cuda"), capability)
+    tile_size = kernel.grid.tile_size
     shapes = [*results, *(jax.typeof(total) for total in totals)]
     # XLA passes operands before results: an aliased operand and its result are one buffer, passed twice.
     aliases = {len(inputs) + k: len(results) + k for k in range(len(totals))}

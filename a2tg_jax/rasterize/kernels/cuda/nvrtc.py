@@ -49,7 +49,8 @@ def ptx(source: str, capability: str) -> str:
       CompilationError: with NVRTC's log.
       ModuleNotFoundError: if NVRTC is not installed.
     """
-    library, program = _library(), ctypes.c_void_p()
+    library = _library()
+    program = ctypes.c_void_p()
     _check(library.nvrtcCreateProgram(ctypes.byref(program), source.encode(), b"tiles.cu", 0, None, None))
     try:
         # Divisions of floats to two units in the last place: exact ones need a fifth of the registers, and branches.
@@ -57,7 +58,8 @@ def ptx(source: str, capability: str) -> str:
         array = (ctypes.c_char_p * len(options))(*(option.encode() for option in options))
         if library.nvrtcCompileProgram(program, len(options), array):
             raise CompilationError(f"NVRTC refused a kernel:\n{_text(program, 'ProgramLog')}")
-        text, least = _text(program, "PTX"), LEAST_ISA.get(int(capability.split(".")[0]))
+        text = _text(program, "PTX")
+        least = LEAST_ISA.get(int(capability.split(".")[0]))
         # A hint that needs version 8.3: bytes of a load that are not used.
         text = re.sub(r'\.pragma "used_bytes_mask[^;]*;', "", text)
         # The version that the kernels need instead of NVRTC's own, which a driver refuses if it is older.

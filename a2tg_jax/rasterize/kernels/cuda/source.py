@@ -58,7 +58,9 @@ def source(kernel: PassSettings, dialect: Dialect) -> str:
     Raises:
       Untranslatable: if the appearance uses a primitive or a dtype that has no translation.
     """
-    functions, tile_size, num_numbers = PixelFunctions(kernel), kernel.grid.tile_size, kernel.num_floats - 1
+    functions = PixelFunctions(kernel)
+    tile_size = kernel.grid.tile_size
+    num_numbers = kernel.num_floats - 1
     # Sums of a splat over pixels: its planes replace the nine numbers of M, and the statistic has three. In NUM_SUMS,
     # they are followed by the number of pixels and, for textures of one texel, that texel.
     count = functions.num_planes + num_numbers - 9 + (3 if kernel.statistic else 0)
@@ -102,14 +104,19 @@ class Argument(NamedTuple):
 
 def _pixel_functions(kernel: PassSettings, functions: PixelFunctions, count: int) -> list[str]:
     """Return the functions that tiles.c calls; `blend_vjp` writes `count` sums."""
-    num_columns, has_texture = kernel.num_columns, kernel.num_columns > 0
-    planes, numbers = Argument("planes", functions.num_planes), Argument("numbers", kernel.num_floats - 1)
-    M, tile = Argument("numbers", 9), (Argument("tile_x"), Argument("tile_y"))
-    region, position = Argument("region", 3 if has_texture else 0, "int"), Argument("position", 2 * has_texture)
+    num_columns = kernel.num_columns
+    has_texture = kernel.num_columns > 0
+    planes = Argument("planes", functions.num_planes)
+    numbers = Argument("numbers", kernel.num_floats - 1)
+    M = Argument("numbers", 9)
+    tile = (Argument("tile_x"), Argument("tile_y"))
+    region = Argument("region", 3 if has_texture else 0, "int")
+    position = Argument("position", 2 * has_texture)
     sample = Argument("sample", num_columns)
     pixel = Argument("x"), Argument("y"), Argument("transmittance"), Argument("is_live", kind="int")
     state = Argument("transmittance_after"), Argument("is_live_after", kind="int")
-    channels, after = Argument("channels", kernel.num_channels), Argument("channels_after", kernel.num_channels)
+    channels = Argument("channels", kernel.num_channels)
+    after = Argument("channels_after", kernel.num_channels)
     printed = [
         c_function("prepare", functions.prepare, [M, *tile], [planes]),
         c_function("prepare_vjp", functions.prepare_vjp, [M, *tile, planes], [Argument("d_M", 9)]),
@@ -132,7 +139,8 @@ def _pixel_functions(kernel: PassSettings, functions: PixelFunctions, count: int
 
 
 def _texture_functions(kernel: PassSettings, region: Argument, position: Argument) -> list[str]:
-    number, integer = example(kernel.dtype), example(jnp.int32)
+    number = example(kernel.dtype)
+    integer = example(jnp.int32)
     place = TextureRegion(integer, integer, integer)
     empty = kernel.static.functions.empty
 
@@ -144,7 +152,8 @@ def _texture_functions(kernel: PassSettings, region: Argument, position: Argumen
         around = tuple(Corner(*numbers) for numbers in zip([None] * 4, *weights, strict=True))
         return bilinear.or_empty(bilinear.interpolate(around, texels), region, empty)
 
-    weights, at_corners = ((number,) * 4,) * 3, ((number,) * kernel.num_columns,) * 4
+    weights = ((number,) * 4,) * 3
+    at_corners = ((number,) * kernel.num_columns,) * 4
     found = [Argument("texel", 4, "int"), Argument("weights", 12)]
     given = [region, Argument("weights", 12), Argument("at_corners", 4 * kernel.num_columns)]
     sample = Argument("sample", 3 * kernel.num_columns)
@@ -190,7 +199,8 @@ def _c_type(dtype: DTypeLike) -> str:
 
 def literal(value: ArrayLike, dtype: DTypeLike) -> str:
     """Return a number as a C literal, exact to the last bit."""
-    kind, dtype = _c_type(dtype), np.dtype(dtype)
+    kind = _c_type(dtype)
+    dtype = np.dtype(dtype)
     if dtype.kind in "bi":
         number, suffix = int(value), "l" if dtype.itemsize == 8 else ""  # type: ignore[arg-type]
         # C reads −2³¹ as minus a number that does not fit.
@@ -235,7 +245,8 @@ def _divide(x: list[str], equation: Equation) -> str:
 
 
 def _convert(x: list[str], equation: Equation) -> str:
-    source, target = operand_dtype(equation), result_dtype(equation)
+    source = operand_dtype(equation)
+    target = result_dtype(equation)
     if target == np.bool_:
         return f"{x[0]} != 0"
     cast = f"({_c_type(target)}){x[0]}"
@@ -243,7 +254,8 @@ def _convert(x: list[str], equation: Equation) -> str:
         info = np.iinfo(target)
         # The floats at and beyond which a conversion gives the least and the largest integer.
         low, high = (literal(bound, source) for bound in (float(info.min), float(source.type(info.max))))
-        least, most = literal(info.min, target), literal(info.max, target)
+        least = literal(info.min, target)
+        most = literal(info.max, target)
         return f"{x[0]} != {x[0]} ? 0 : {x[0]} <= {low} ? {least} : {x[0]} >= {high} ? {most} : {cast}"
     return cast
 

@@ -105,7 +105,8 @@ def _parts(starts: np.ndarray) -> list[ffi.Span]:
 
     `starts` [items + 1] has the start of each item's pairs.
     """
-    num_items, num_pairs = len(starts) - 1, int(starts[-1])
+    num_items = len(starts) - 1
+    num_pairs = int(starts[-1])
     count = max(1, min(ffi.num_threads(), num_pairs // PAIRS_PER_THREAD))
     # A tile costs one more than its pairs, so that tiles without pairs are divided, too.
     work = starts.astype(np.int64) + np.arange(num_items + 1)
@@ -141,8 +142,10 @@ class SumsOfParts:
         d_splats, d_texels, d_probe = self.results = results
         # The extra row of every pair, −1 if it has none; the splat of every extra row; the borders between the parts'.
         self.places = np.full(max(1, starts[parts[-1][1]]), -1, np.int32)
-        self.borders, splats_of_parts = [0], []
-        is_listed, row = np.zeros(len(d_splats), bool), np.empty(len(d_splats), np.int32)
+        self.borders = [0]
+        splats_of_parts = []
+        is_listed = np.zeros(len(d_splats), bool)
+        row = np.empty(len(d_splats), np.int32)
         for index, (first, last) in enumerate(parts):
             listed = ids[starts[first] : starts[last]]
             again = np.flatnonzero(is_listed[listed]) if index else np.zeros(0, np.int64)
@@ -163,7 +166,8 @@ class SumsOfParts:
         self.is_shared = has_textures and len(parts) > 1 and _overlap(regions)
         if self.is_shared:
             self.texels_of_parts = [d_texels, *(np.zeros_like(d_texels) for _ in parts[1:])]
-            self.more_texels, more_first = self.texels_of_parts, self.regions[:, 0]
+            self.more_texels = self.texels_of_parts
+            more_first = self.regions[:, 0]
         else:
             areas = self.regions[:, 1].astype(np.int64) * self.regions[:, 2]
             self.ends = np.concatenate([[0], np.cumsum(areas)])
@@ -193,7 +197,8 @@ class SumsOfParts:
         if len(d_probe) == len(d_splats):
             d_probe[splats] += self.more_probe[first:last]
         if not self.is_shared and len(self.regions):
-            begins, ends = self.ends[first:last], self.ends[first + 1 : last + 1]
+            begins = self.ends[first:last]
+            ends = self.ends[first + 1 : last + 1]
             # Extra texels are one after the other, row by row: each is moved from its row's begin to its texture's.
             entries = np.arange(self.ends[first], self.ends[last])
             more = self.more_texels[0][self.ends[first] : self.ends[last]]
@@ -201,10 +206,12 @@ class SumsOfParts:
 
 
 def _overlap(regions: np.ndarray) -> bool:
-    first, area = regions[:, 0].astype(np.int64), regions[:, 1].astype(np.int64) * regions[:, 2]
+    first = regions[:, 0].astype(np.int64)
+    area = regions[:, 1].astype(np.int64) * regions[:, 2]
     # Sorted by first texel; the area comes along in the lower bits.
     both = np.sort(first << 32 | area)
-    first, area = both >> 32, both & 0xFFFFFFFF
+    first = both >> 32
+    area = both & 0xFFFFFFFF
     return bool(np.any(first[:-1] + area[:-1] > first[1:]))
 
 
@@ -226,7 +233,8 @@ def _list_handler(functions: list[CompiledFunction], arguments: list[np.ndarray]
     ids, starts, total, overflow = results
     columns, width, height = map(int, size)
     num = len(cutoff)
-    outlines, rectangles = np.empty((num, len(Outline._fields)), M.dtype), np.empty((num, 4), np.int32)
+    outlines = np.empty((num, len(Outline._fields)), M.dtype)
+    rectangles = np.empty((num, 4), np.int32)
 
     def bound(first: int, last: int, _: int) -> None:
         run_bound(*_addresses(M, cutoff, outlines, rectangles), first, last, width, height)

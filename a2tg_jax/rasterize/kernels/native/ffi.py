@@ -47,7 +47,9 @@ EXECUTE_STAGE = 3
 INTERNAL_ERROR = 13
 DTYPES = {1: np.bool_, 4: np.int32, 5: np.int64, 8: np.uint32, 11: np.float32, 12: np.float64}
 
-_pointer, _size, _int = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
+_pointer = ctypes.c_void_p
+_size = ctypes.c_size_t
+_int = ctypes.c_int
 
 
 def _structure(name: str, **fields: Any) -> Any:
@@ -128,7 +130,8 @@ def call(name: str, results: Sequence[tuple[tuple[int, ...], DTypeLike]], *input
 
 def _capsule(address: int | None, destructor: int | None = None) -> object:
     new = ctypes.pythonapi.PyCapsule_New
-    new.restype, new.argtypes = ctypes.py_object, (_pointer, ctypes.c_char_p, _pointer)
+    new.restype = ctypes.py_object
+    new.argtypes = (_pointer, ctypes.c_char_p, _pointer)
     return new(address, None, destructor)
 
 
@@ -177,7 +180,8 @@ def _entry(handler: Handler) -> Callable[..., int | None]:
     """Return the function that XLA calls; it returns None on success, else the address of an error."""
 
     def enter(pointer: Any) -> int | None:
-        frame, interrupts = pointer.contents, list[int]()
+        frame = pointer.contents
+        interrupts = list[int]()
         dropped_last: list[object] = []
         # No exception may pass through C: it would be lost, and the unfilled results would count as computed.
         try:
@@ -232,7 +236,8 @@ def _arrays(buffers: Any) -> list[np.ndarray]:
     arrays = []
     for index in range(buffers.num):
         buffer = buffers.buffers[index].contents
-        shape, dtype = tuple(buffer.dims[: buffer.rank]), np.dtype(DTYPES[buffer.dtype])
+        shape = tuple(buffer.dims[: buffer.rank])
+        dtype = np.dtype(DTYPES[buffer.dtype])
         num_bytes = math.prod(shape) * dtype.itemsize
         # Buffers without numbers may have no address.
         memory = (ctypes.c_ubyte * num_bytes).from_address(buffer.data) if num_bytes else bytearray()

@@ -52,7 +52,8 @@ class Lanes:
     """Operations at a builder's position on vectors of `width` lanes; `width` 1 means plain scalars."""
 
     def __init__(self, builder: ir.IRBuilder, width: int):
-        self.builder, self.width = builder, width
+        self.builder = builder
+        self.width = width
 
     def emit(self, closed: core.ClosedJaxpr, arguments: Sequence[ir.Value]) -> list[ir.Value]:
         """Emit a jaxpr of scalars, given one LLVM value per argument; return its values.
@@ -103,12 +104,14 @@ class Lanes:
         if self.width == 1:
             return value
         scalar = value.type.element
-        operands, flags = [ir.Constant(scalar, 0.0), value], ("reassoc", "nsz", "contract")
+        operands = [ir.Constant(scalar, 0.0), value]
+        flags = ("reassoc", "nsz", "contract")
         return self.call(f"vector.reduce.fadd.{suffix(value.type)}", scalar, operands, flags)
 
     def fold(self, value: ir.Value, combine: Callable[[ir.Value, ir.Value], ir.Value], to: int = 1) -> ir.Value:
         """Combine the halves of a vector until `to` lanes are left; one lane is a scalar."""
-        b, width = self.builder, self.width
+        b = self.builder
+        width = self.width
         while width > to:
             width //= 2
             masks = (ir.Constant(ir.VectorType(INT, width), list(range(first, first + width))) for first in (0, width))
@@ -144,7 +147,8 @@ class Lanes:
                 return self.builder.fadd(self.larger(zero, other), zero)
         # Two orders that agree are both right. Otherwise there is a NaN, or zeros of both signs: the union of the bits,
         # with the signs intersected, is the result.
-        b, sign = self.builder, self._sign_bits(x.type)
+        b = self.builder
+        sign = self._sign_bits(x.type)
         one, other = (b.xor(self._as_bits(self.larger(*pair)), sign) for pair in ((x, y), (y, x)))
         return b.bitcast(b.xor(b.or_(one, other), sign), x.type)
 
@@ -188,7 +192,8 @@ def _binary(for_floats: str, for_integers: str) -> Emitter:
 
 def _comparison(symbol: str) -> Emitter:
     def emit(lanes: Lanes, operands: Operands, _: Equation) -> ir.Value:
-        b, type_ = lanes.builder, operands[0].type
+        b = lanes.builder
+        type_ = operands[0].type
         if is_float(type_):
             # NaN differs from everything, itself included, and is neither less nor greater.
             return (b.fcmp_unordered if symbol == "!=" else b.fcmp_ordered)(symbol, *operands)
@@ -249,7 +254,8 @@ def _absolute(lanes: Lanes, operands: Operands, equation: Equation) -> ir.Value:
 
 def _convert(lanes: Lanes, operands: Operands, equation: Equation) -> ir.Value:
     (x,), b = operands, lanes.builder
-    source, target = operand_dtype(equation), result_dtype(equation)
+    source = operand_dtype(equation)
+    target = result_dtype(equation)
     type_ = lanes.vector(scalar_type(target))
     if source == target:
         return x
@@ -307,7 +313,8 @@ def exp(x: Array) -> Array:
     # At 1.5·2²³ floats are whole numbers: the sum rounds, and n + 126 is in its lowest bits.
     magic = 1.5 * 2**23 + 126
     shifted = x * math.log2(math.e) + magic
-    n, bits = shifted - magic, lax.bitcast_convert_type(shifted, jnp.int32)
+    n = shifted - magic
+    bits = lax.bitcast_convert_type(shifted, jnp.int32)
     r = (x - n * LN2_HIGH) - n * LN2_LOW
     tail = _polynomial(r, 0.99999988079, 0.33333042264, 0.08333677798, 0.01673742011, 0.00276292209)
     twice_exp = (tail * r + 2.0) * r + 2.0
@@ -321,7 +328,8 @@ def log(x: Array) -> Array:
     # x = 2ⁿ·(1 + f) with 1 + f in [√½, √2]; 0x3F3504F3 are the bits of √½.
     bits = lax.bitcast_convert_type(x, jnp.int32)
     exponent = (bits - 0x3F3504F3) >> 23
-    f, n = lax.bitcast_convert_type(bits - exponent * 2**23, jnp.float32) - 1.0, exponent.astype(jnp.float32)
+    f = lax.bitcast_convert_type(bits - exponent * 2**23, jnp.float32) - 1.0
+    n = exponent.astype(jnp.float32)
     tail = _polynomial(
         f, 0.33333313465, -0.25000008941, 0.20002119243, -0.16667996347, 0.14219550789,
         -0.12405591458, 0.11888174713, -0.11675640941, 0.06746601313,
@@ -336,7 +344,8 @@ def log(x: Array) -> Array:
 
 def _elementary(formula: Callable[[Array], Array]) -> Emitter:
     """Make an emitter of a formula in float32, and of libm's function of its name in float64."""
-    of_libm, jaxpr = _libm(formula.__name__), functools.cache(lambda: trace(formula, example(np.float32))[0])
+    of_libm = _libm(formula.__name__)
+    jaxpr = functools.cache(lambda: trace(formula, example(np.float32))[0])
 
     def emit(lanes: Lanes, operands: Operands, equation: Equation) -> ir.Value:
         if num_bits(operands[0].type) == 64:

@@ -38,8 +38,12 @@ def _outline_of(dtype: str) -> Outline:
 
 def _write_bound(module: ir.Module, name: str, dtype: str, tile_size: int, near_plane: float) -> None:
     w = Writer(module, name, BOUND, ("first", "last", "width", "height"), dtype)
-    b, given, scalars = w.b, w.arguments, Lanes(w.b, 1)
-    number, integer, outline = example(dtype), example(jnp.int32), _outline_of(dtype)
+    b = w.b
+    given = w.arguments
+    scalars = Lanes(w.b, 1)
+    number = example(dtype)
+    integer = example(jnp.int32)
+    outline = _outline_of(dtype)
     M = ((number,) * 3,) * 3
 
     def rectangle(bounds: ScreenBounds, width: int, height: int) -> Rectangles:
@@ -54,7 +58,8 @@ def _write_bound(module: ir.Module, name: str, dtype: str, tile_size: int, near_
         numbers = [w.load(base, k, w.real) for k in range(9)]
         cutoff = w.load(given["cutoff"], id_, w.real)
         bounds = scalars.emit(bounds_of, [*numbers, cutoff])
-        box, own = bounds[:4], bounds[4:]
+        box = bounds[:4]
+        own = bounds[4:]
         for edge, room in zip(box, rooms, strict=True):
             b.store(edge, room)
         # Splats that cross the near plane are few, and their boxes cost more: a branch, not a select.
@@ -74,7 +79,9 @@ def _write_bound(module: ir.Module, name: str, dtype: str, tile_size: int, near_
 
 def _write_find(module: ir.Module, name: str, dtype: str, tile_size: int) -> None:
     w = Writer(module, name, FIND, ("num_splats", "columns"), dtype)
-    b, given, number = w.b, w.arguments, example(dtype)
+    b = w.b
+    given = w.arguments
+    number = example(dtype)
     touches, _ = trace(functools.partial(outline_touches, tile_size=tile_size), _outline_of(dtype), number, number)
     num_found = w.variable(LONG)
     b.store(LONG(0), num_found)
@@ -107,7 +114,8 @@ def _write_find(module: ir.Module, name: str, dtype: str, tile_size: int) -> Non
 
 def _write_place(module: ir.Module, name: str) -> None:
     w = Writer(module, name, PLACE, ("num_pairs",), "float32")
-    b, given = w.b, w.arguments
+    b = w.b
+    given = w.arguments
     with w.loop(LONG(0), w.long(given["num_pairs"])) as (pair, _):
         tile = w.long(w.load(given["tiles"], pair, INT))
         cursor = w.load(given["cursors"], tile, INT)

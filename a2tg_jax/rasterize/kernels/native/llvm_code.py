@@ -58,7 +58,8 @@ class Writer:
         # In the entry block: within a loop, the stack would grow at every turn.
         with self.b.goto_entry_block():
             room = self.b.alloca(type_, count)
-            room.align, room.type = ALIGNMENT, POINTER
+            room.align = ALIGNMENT
+            room.type = POINTER
         return room
 
     def at(self, base: ir.Value, index: ir.Value, type_: ir.Type) -> ir.Value:
@@ -94,7 +95,8 @@ class Writer:
         # The index is a variable on the stack, which LLVM's passes turn into a register.
         counter = self.variable(LONG)
         self.b.store(first, counter)
-        test, body = self.b.append_basic_block("test"), self.b.append_basic_block("body")
+        test = self.b.append_basic_block("test")
+        body = self.b.append_basic_block("body")
         after = self.b.append_basic_block("after")
         self.b.branch(test)
         self.b.position_at_end(test)
@@ -174,7 +176,8 @@ def compiled(module: ir.Module, signatures: dict[str, tuple[int, int]]) -> list[
 
     The signatures are the number of pointers and of integers of each function, by name.
     """
-    addresses, found = compile_text(str(module), list(signatures)), list[CompiledFunction]()
+    addresses = compile_text(str(module), list(signatures))
+    found = list[CompiledFunction]()
     for name, (pointers, integers) in signatures.items():
         types = [ctypes.c_void_p] * pointers + [ctypes.c_int32] * integers
         found.append(ctypes.CFUNCTYPE(None, *types)(addresses[name]))

@@ -46,7 +46,8 @@ others are awaited, and a branch for many pixels is rarely a surprise. With text
 
 def lanes_of(settings: PassSettings, vector_bytes: int) -> int:
     """Return the number L of pixels of a pass's vectors."""
-    in_register, itemsize = llvm_code.num_lanes(settings.dtype), np.dtype(settings.dtype).itemsize
+    in_register = llvm_code.num_lanes(settings.dtype)
+    itemsize = np.dtype(settings.dtype).itemsize
     # In float64, exp is called lane by lane, also for lanes that are not reached.
     if settings.num_columns or itemsize > 4:
         return in_register
@@ -112,8 +113,11 @@ class _Pass(TexelWriter):
     def __init__(self, functions: PixelFunctions, module: ir.Module, name: str, buffers: Sequence[str]):
         settings = functions.settings
         super().__init__(module, name, buffers, INTEGERS, settings.dtype)
-        self.settings, self.functions, self.num_columns = settings, functions, settings.num_columns
-        self.empty, self.tile_size = settings.static.functions.empty, settings.grid.tile_size
+        self.settings = settings
+        self.functions = functions
+        self.num_columns = settings.num_columns
+        self.empty = settings.static.functions.empty
+        self.tile_size = settings.grid.tile_size
         self.lanes, self.scalars = Lanes(self.b, lanes_of(settings, self.vector_bytes)), Lanes(self.b, 1)
         self.num_vectors = -(-settings.num_pixels // self.lanes.width)
         self.reals, self.integers = self.lanes.vector(self.real), self.lanes.vector(INT)
@@ -133,14 +137,18 @@ class _Pass(TexelWriter):
         """Add a table of constants to the module; return its address."""
         array = ir.Constant(ir.ArrayType(type_, len(numbers)), np.asarray(numbers).tolist())
         table = ir.GlobalVariable(self.b.module, array.type, name)
-        table.initializer, table.global_constant, table.align = array, True, llvm_code.ALIGNMENT
+        table.initializer = array
+        table.global_constant = True
+        table.align = llvm_code.ALIGNMENT
         table.type = ir.PointerType()
         return table
 
     def tiles(self) -> Iterator[tuple[ir.Value, list[ir.Value]]]:
         """Write a loop over the tiles; yield each one's index and `rasterize.pixel.TileNumbers`. Then end the
         function."""
-        b, given, size = self.b, self.arguments, self.tile_size
+        b = self.b
+        given = self.arguments
+        size = self.tile_size
         with self.loop(self.long(given["first"]), self.long(given["last"])) as (tile, _):
             if self.settings.has_rays:
                 yield tile, self._tile_with_rays(tile)
@@ -153,9 +161,11 @@ class _Pass(TexelWriter):
 
     def _tile_with_rays(self, tile: ir.Value) -> list[ir.Value]:
         """Take the pixels of a tile from the buffer (`packed_pixels`); return its numbers."""
-        width, num = self.lanes.width, self.functions.num_tile_numbers
+        width = self.lanes.width
+        num = self.functions.num_tile_numbers
         # Each part fills whole vectors, as `packed_pixels` has padded it.
-        header, part = -(-num // width) * width, self.num_vectors * width
+        header = -(-num // width) * width
+        part = self.num_vectors * width
         base = self.at(self.arguments["pixels"], self.times(tile, header + 3 * part), self.real)
         parts = (self.at(base, LONG(header + k * part), self.real) for k in range(3))
         self.pixel_x, self.pixel_y, self.is_seen = parts
@@ -163,7 +173,8 @@ class _Pass(TexelWriter):
 
     def splats(self, tile: ir.Value) -> Iterator[tuple[ir.Value, ir.Value]]:
         """Write a loop over a tile's list, until no pixel is live; yield each splat's id, and position in `ids`."""
-        starts, b = self.arguments["starts"], self.b
+        starts = self.arguments["starts"]
+        b = self.b
         first, last = (self.long(self.load(starts, b.add(tile, LONG(k)), INT)) for k in (0, 1))
         with self.loop(first, last) as (position, done):
             yield self.long(self.load(self.arguments["ids"], position, INT)), position
@@ -181,7 +192,8 @@ class _Pass(TexelWriter):
 
     def begin_tile(self, tile: list[ir.Value]) -> None:
         """Set the transmittance to 1, and the pixels live that are inside the image and have a ray."""
-        b, lanes = self.b, self.lanes
+        b = self.b
+        lanes = self.lanes
         with self.all_vectors() as (k, _):
             self.store(lanes.constant(1.0, self.real), self.transmittance, k)
             if self.settings.has_rays:
@@ -198,7 +210,8 @@ class _Pass(TexelWriter):
 
     def load_splat(self, id_: ir.Value, tile: list[ir.Value]) -> _LoadedSplat:
         """Load a splat of the list and prepare it for a tile."""
-        num_floats, given = self.settings.num_floats, self.arguments
+        num_floats = self.settings.num_floats
+        given = self.arguments
         row = self.at(given["splats"], self.times(id_, num_floats), self.real)
         *numbers, cutoff = (self.load(row, k, self.real) for k in range(num_floats))
         planes = self.scalars.emit(self.functions.prepare, [*numbers[:9], *tile])
@@ -211,11 +224,13 @@ class _Pass(TexelWriter):
 
     def reached_vectors(self, splat: _LoadedSplat) -> Iterator[_Vector]:
         """Write a loop over the vectors of pixels that a splat may reach; gather in `any_live` which are live after."""
-        b, lanes = self.b, self.lanes
+        b = self.b
+        lanes = self.lanes
         none = lanes.constant(0, INT)
         b.store(none, self.any_live)
         with self.all_vectors() as (k, _):
-            x, y = self.load(self.pixel_x, k, self.reals), self.load(self.pixel_y, k, self.reals)
+            x = self.load(self.pixel_x, k, self.reals)
+            y = self.load(self.pixel_y, k, self.reals)
             rho, *position = lanes.emit(self.functions.reach, [*splat.planes, *splat.spread_region, x, y])
             is_live = b.icmp_signed("!=", self.load(self.live, k, self.integers), none)
             # An unordered ρ is not reached: NaN fails every comparison.
@@ -249,14 +264,16 @@ class _Forward(_Pass):
                 splat = self.load_splat(id_, tile_numbers)
                 for vector in self.reached_vectors(splat):
                     self.composite(splat, vector, channels)
-            arrays, num_pixels = [*channels, self.transmittance], self.settings.num_pixels
+            arrays = [*channels, self.transmittance]
+            num_pixels = self.settings.num_pixels
             base = self.at(self.arguments["result"], self.times(tile, num_pixels * len(arrays)), self.real)
             for index, array in enumerate(arrays):
                 with self.loop(LONG(0), LONG(num_pixels)) as (k, _):
                     self.store(self.load(array, k, self.real), base, self.pixel(k, index))
 
     def composite(self, splat: _LoadedSplat, vector: _Vector, channels: Sequence[ir.Value]) -> None:
-        k, place = vector.k, vector.place
+        k = vector.k
+        place = vector.place
         values = self.sample(splat.texture, place, has_slopes=False) if splat.texture and place else []
         before = [self.load(channel, k, self.reals) for channel in channels]
         state = [self.load(self.transmittance, k, self.reals), vector.is_live, *before]
@@ -273,7 +290,8 @@ class _Backward(_Pass):
     vector_bytes = BACKWARD_BYTES
 
     def write(self) -> None:
-        b, settings = self.b, self.settings
+        b = self.b
+        settings = self.settings
         num_arrays = 1 + settings.num_channels
         self.suffix_sum, *self.g = (self.variable(self.reals, self.num_vectors) for _ in range(num_arrays))
         self.sums = self.variable(self.reals, self.num_sums)
@@ -316,7 +334,10 @@ class _Backward(_Pass):
         d_texture: NativeTexture | None,
     ) -> None:  # fmt: skip
         """Add the cotangents of a splat at a vector of pixels to the totals, and its texels' to theirs."""
-        b, lanes, k, place = self.b, self.lanes, vector.k, vector.place
+        b = self.b
+        lanes = self.lanes
+        k = vector.k
+        place = vector.place
         sample = self.sample(splat.texture, place, has_slopes=True) if splat.texture and place else []
         transmittance, suffix_sum, *cotangents = (
             self.load(array, k, self.reals) for array in (self.transmittance, self.suffix_sum, *self.g)
@@ -326,7 +347,8 @@ class _Backward(_Pass):
         after, still_live, left, contributes, *rest = lanes.emit(self.functions.backward, at_pixel)
         self.store_state(k, after, still_live)
         self.store(left, self.suffix_sum, k)
-        d_values, sums = rest[: self.num_columns], rest[self.num_columns :]
+        d_values = rest[: self.num_columns]
+        sums = rest[self.num_columns :]
         if self.settings.statistic:
             sums.append(lanes.constant(1.0, self.real))
         # Selected, not multiplied: the cotangents of a pixel that shows nothing may not be finite.
@@ -343,7 +365,8 @@ class _Backward(_Pass):
     ) -> tuple[ir.Value, ir.Value, NativeTexture | None]:
         """Return the addresses to which a pair adds the cotangents of its splat's numbers, the statistic, and the
         cotangents of its texels, if the appearance has textures."""
-        b, arguments = self.b, self.arguments
+        b = self.b
+        arguments = self.arguments
         place = self.long(self.load(arguments["places"], position, INT))
         is_own = b.icmp_signed("<", place, LONG(0))
         # Selects of addresses, not a branch: the code that adds is there once.
@@ -366,7 +389,8 @@ class _Backward(_Pass):
         """Sum over lanes, carry the planes' cotangents to the homography, and add all to the splat's rows."""
         functions = self.functions
         sums = [self.lanes.sum(self.b.load(total, typ=self.reals)) for total in totals]
-        d_planes, others = sums[: functions.num_planes], sums[functions.num_planes :]
+        d_planes = sums[: functions.num_planes]
+        others = sums[functions.num_planes :]
         # All pixels of a tile share the planes: their cotangents are summed first, and pulled back to M once.
         d_M = self.scalars.emit(functions.prepare_vjp, [*numbers[:9], *tile, *d_planes])
         num_others = len(numbers) - 9
@@ -379,7 +403,8 @@ class _Backward(_Pass):
 @functools.cache
 def compiled_passes(kernel: PassSettings) -> dict[str, CompiledFunction]:
     """Return the passes `forward` and `backward` of a kernel, compiled at the first call."""
-    functions, module = PixelFunctions(kernel), ir.Module("passes")
+    functions = PixelFunctions(kernel)
+    module = ir.Module("passes")
     forward, backward = (llvm_code.unique(name) for name in ("forward", "backward"))
     _Forward(functions, module, forward, FORWARD).write()
     _Backward(functions, module, backward, BACKWARD).write()

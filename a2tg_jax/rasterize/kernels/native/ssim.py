@@ -46,7 +46,8 @@ def value_and_slopes(score: Score, x: Array, y: Array) -> tuple[Array, Array, Ar
     derivatives by x and y."""
     count, height, width = x.shape
     margin = len(score.taps) - 1
-    down, across = height - margin, width - margin
+    down = height - margin
+    across = width - margin
     shapes = (count * down,), (4, count, down + 2 * margin, across)
     name = _registered(score, str(x.dtype), "score")
     sums, (d_x_mean, d_y_mean, *d_products) = ffi.call(name, [(shape, x.dtype) for shape in shapes], x, y)
@@ -110,10 +111,12 @@ class _ImageRows(Writer):
         Yields:
           The start of each vector, and how many of its numbers the vector before contains.
         """
-        b, length = self.b, LONG(self.lanes.width)
+        b = self.b
+        length = LONG(self.lanes.width)
         with self.loop(LONG(0), b.sdiv(b.add(num, LONG(self.lanes.width - 1)), length)) as (k, _):
             # The last vector begins L numbers before the end, so that no code for a remainder is needed.
-            place, last = b.mul(k, length), b.sub(num, length)
+            place = b.mul(k, length)
+            last = b.sub(num, length)
             start = b.select(b.icmp_signed("<", place, last), place, last)
             yield start, b.sub(place, start)
 
@@ -139,11 +142,13 @@ class _ScoreRows(_ImageRows):
         b = self.b
         with_slopes, _ = trace(jax.value_and_grad(self.score.function, argnums=(0, 1, 2, 3)), *[example(dtype)] * 4)
         lane = ir.Constant(self.lanes.vector(INT), list(range(self.lanes.width)))
-        total, zero = self.variable(self.reals), self.lanes.constant(0.0, self.real)
+        total = self.variable(self.reals)
+        zero = self.lanes.constant(0.0, self.real)
         means = [self.row("rows", LONG(k), self.width) for k in range(4)]
         padded = b.add(self.down, LONG(2 * self.margin))
         with self.loop_over_rows() as (index, _):
-            channel, y = b.sdiv(index, self.down), b.srem(index, self.down)
+            channel = b.sdiv(index, self.down)
+            y = b.srem(index, self.down)
             self.store_columns(means, b.add(b.mul(channel, self.height), y))
             b.store(zero, total)
             with self.vectors(self.across) as (start, num_done):
@@ -171,12 +176,14 @@ class _ScoreRows(_ImageRows):
 
 class _PullBackRows(_ImageRows):
     def write(self) -> None:
-        b, taps = self.b, self.score.taps[::-1]
+        b = self.b
+        taps = self.score.taps[::-1]
         length = b.add(self.width, LONG(self.margin))
         rows = [self.row("rows", LONG(k), length) for k in range(3)]
         two, share = map(self.lanes.broadcast, (self.real(2.0), self.load(self.arguments["share"], 0, self.real)))
         with self.loop_over_rows() as (index, _):
-            channel, y = b.sdiv(index, self.height), b.srem(index, self.height)
+            channel = b.sdiv(index, self.height)
+            y = b.srem(index, self.height)
             first = b.add(b.mul(channel, b.add(self.height, LONG(self.margin))), y)
             with self.vectors(self.across) as (start, _):
                 for name, row in zip(PULL_BACK[2:5], rows, strict=True):

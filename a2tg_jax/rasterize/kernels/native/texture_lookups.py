@@ -78,7 +78,8 @@ class TexelWriter(Writer):
                 continue
             for row in self.rows(texture, width, place, has_slopes):
                 # Bilinear weights are products: a row is summed by the columns' weights, and weighed once.
-                in_row, in_row_along_x = self.zeros(count), self.zeros(num_slopes)
+                in_row = self.zeros(count)
+                in_row_along_x = self.zeros(num_slopes)
                 for column in self.columns(texture, width, place, has_slopes):
                     texel = self.texel(texture, column, row)
                     numbers = [self.lanes.broadcast(self.load(texel, k, self.real)) for k in range(count)]
@@ -110,7 +111,8 @@ class TexelWriter(Writer):
 
     def finish_texels(self, texture: NativeTexture) -> None:
         """Add the lanes' sums of a small texture to the cotangents of its texels."""
-        b, zero = self.b, self.lanes.constant(0.0, self.real)
+        b = self.b
+        zero = self.lanes.constant(0.0, self.real)
         num = b.select(
             b.icmp_signed(">", self.small_width(texture), LONG(0)), b.mul(texture.height, texture.width), LONG(0)
         )
@@ -131,7 +133,8 @@ class TexelWriter(Writer):
     def cases(self, texture: NativeTexture) -> Iterator[int | None]:
         """Write branches, which the caller fills: one per width of a small texture, and one (None) for large ones."""
         b = self.b
-        large, end = b.append_basic_block("large"), b.append_basic_block("end")
+        large = b.append_basic_block("large")
+        end = b.append_basic_block("end")
         switch = b.switch(self.small_width(texture), large)
         for width in (*self.small_widths, None):
             block = large if width is None else b.append_basic_block(f"width{width}")
@@ -147,7 +150,8 @@ class TexelWriter(Writer):
         if width is None:
             span, y = self.seen(place.y, place.is_reached, texture.height)
         else:
-            span, y = (LONG(0), texture.height), place.y
+            span = (LONG(0), texture.height)
+            y = place.y
         with self.loop(*span) as (index, _):
             yield self.line(index, y, texture.height, has_slope)
 
@@ -168,7 +172,8 @@ class TexelWriter(Writer):
     ) -> tuple[tuple[ir.Value, ir.Value], ir.Value]:
         """Return the first texel along an axis that the reached lanes see, and the end, which is excluded; and all
         lanes' places, moved between the reached ones."""
-        b, number = self.b, functools.partial(self.lanes.constant, scalar=self.real)
+        b = self.b
+        number = functools.partial(self.lanes.constant, scalar=self.real)
         # An axis without texels has an empty range, not one that begins before the first texel.
         last = b.select(b.icmp_signed(">", size, LONG(0)), b.sub(size, LONG(1)), LONG(0))
         most = self.lanes.broadcast(b.sitofp(last, self.real))
@@ -186,7 +191,8 @@ class TexelWriter(Writer):
 
     def line(self, index: ir.Value, places: ir.Value, size: ir.Value, has_slope: bool) -> Line:
         """Return one of `size` rows or columns, seen from `places`."""
-        b, number = self.b, functools.partial(self.lanes.constant, scalar=self.real)
+        b = self.b
+        number = functools.partial(self.lanes.constant, scalar=self.real)
         distance = b.fsub(places, self.lanes.broadcast(b.sitofp(index, self.real)))
         weight = self.lanes.larger(b.fsub(number(1.0), self.lanes.intrinsic("fabs", [distance])), number(0.0))
         if not has_slope:
@@ -241,7 +247,8 @@ class TexelWriter(Writer):
         """Transpose every four lanes of four vectors as a 4×4 matrix: in pairs, then in pairs of pairs."""
         low01, low23 = (self.shuffle(vectors[k], vectors[k + 1], (0, "0", 1, "1")) for k in (0, 2))
         high01, high23 = (self.shuffle(vectors[k], vectors[k + 1], (2, "2", 3, "3")) for k in (0, 2))
-        first, second = (0, 1, "0", "1"), (2, 3, "2", "3")
+        first = (0, 1, "0", "1")
+        second = (2, 3, "2", "3")
         pairs = (low01, low23, first), (low01, low23, second), (high01, high23, first), (high01, high23, second)
         return [self.shuffle(*pair) for pair in pairs]
 
