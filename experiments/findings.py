@@ -11,7 +11,7 @@ from lab.grid import Grid, read_grid
 from lab.jobs import Record
 from lab.kept import read_kept
 from lab.statistics import Comparison, bootstrap, compare, differences, holm
-from lab.tables import EQUAL_BYTES, Result
+from lab.tables import EQUAL_BYTES, EQUAL_TIME, Result
 from matplotlib.figure import Figure
 
 from a2tg_jax.results.figures import save_figure
@@ -43,7 +43,6 @@ BYTEWISE, SECOND, FIRST = "Bytewise", "Bytewise, second version", "Bytewise, fir
 VERSIONS = {BYTEWISE: "bytewise", SECOND: "bytewise 2", FIRST: "bytewise 1"}
 """Names in the table of `bytewise` and of its earlier versions: the second places no Gaussians by errors of pictures,
 and the first has textures and no weight on opacities either."""
-EQUAL_TIME = ", equal time"
 PRIMARY = f"{VERSIONS[FIRST]} − best plain method, 0.3 MB"
 REGISTERED = ", the registered endpoint"
 SECONDARY = {
@@ -198,7 +197,12 @@ def rows_at_length(grid: Grid, degree: int, records: Mapping[str, Record], place
 def rows_of_quick(grid: Grid, degree: int, records: Mapping[str, Record]) -> list[Row]:
     """Return the comparisons of the present A²TG of `quick` with plain Gaussians (E7)."""
     own = {suffixed(PRESENT, degree) + EQUAL_BYTES: A2TG}
-    return rows_against(grid, degree, tables.results_of(grid, records), own, QUICK, is_on_page=True)
+    rows = []
+    for size, results in tables.grouped(tables.results_of(grid, records), bytes_per_pixel):
+        is_on_page = size == QUICK_SIZE
+        place = QUICK if is_on_page else f"{size} bytes a pixel"
+        rows += rows_against(grid, degree, results, own, place, is_on_page)
+    return rows
 
 
 def rows_of_earlier_quick(grid: Grid, degree: int, records: Mapping[str, Record]) -> list[Row]:

@@ -1,4 +1,4 @@
-"""Run experiments by name: train what is missing, then write their tables, charts and pictures.
+"""Run experiments by name: train what is missing, then write their tables and charts.
 
     python experiments/run.py fixed_memory ablation --scenes SCENES --lpips-weights lpips_alex.npz
     python experiments/run.py all --scenes SCENES --scale small --lpips-weights lpips_alex.npz
@@ -31,9 +31,7 @@ from a2tg_jax import configure_cpu
 from a2tg_jax.host import signals
 from a2tg_jax.host.text import did_you_mean
 
-MODULES = (
-    "choose_plain", "findings", "ablation", "resolution_shares", "decomposition", "comparison_pictures", "efficiency",
-)  # fmt: skip
+MODULES = ("choose_plain", "findings", "claims", "ablation", "resolution_shares", "efficiency")
 """Modules of this folder that hold an EXPERIMENT; the one that measures time comes last."""
 EVERYTHING, PAGES = "all", "pages"
 OTHERS = {

@@ -306,7 +306,10 @@ def test_fisheyes_of_metashape(tmp_path, projection, terms):
             metashape_xml(WORLD).replace('type="frame"', 'type="fisheye"').replace("</f>", "</f><p3>1</p3>"),
             "p3, p4 or b2",
         ),
-        (metashape_xml(WORLD).replace('type="frame"', 'type="equisolid_fisheye"'), "its equisolid lens has p1, p2"),
+        (
+            metashape_xml(WORLD).replace('type="frame"', 'type="equisolid_fisheye"'),
+            "its equisolid_fisheye lens has p1, p2",
+        ),
         (metashape_xml(WORLD, lens=""), "is of a sensor without a calibration"),
         (metashape_xml(WORLD).replace("<f>100</f>", "<f>long</f>"), "1 numbers are expected; got long"),
         ('<!DOCTYPE x [<!ENTITY a "a">]><chunk><sensors/></chunk>', "it declares entities"),

@@ -13,7 +13,8 @@ import pytest
 from a2tg_jax.cli import main as cli
 
 ROOT = Path(__file__).parent.parent
-PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+NOTEBOOK = ROOT / "experiments" / "NOTEBOOK.md"
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *NOTEBOOK.parent.glob("*.md")])
 ROOMS = "|".join(path.parent.name for path in sorted((ROOT / "a2tg_jax").glob("*/__init__.py")))
 FOLDERS = "a2tg_jax|benchmarks|docs|experiments|notebooks|tests|web"
 
@@ -37,6 +38,16 @@ def test_links_lead_somewhere(page):
         file = (page.parent / name).resolve() if name else page
         assert file.exists(), f"{target} leads nowhere"
         assert not anchor or anchor in anchors(file), f"{target}: no such heading"
+
+
+def test_code_names_sections_of_the_notebook():
+    """By the first words of their titles."""
+    titles = [title.replace("`", "") for title in re.findall(r"^## (.*)$", NOTEBOOK.read_text(encoding="utf-8"), re.M)]
+    code = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "a2tg_jax").rglob("*.py"))
+    named = set(re.findall(r'experiments/NOTEBOOK\.md, "([^"]+)"', code))
+    assert len(named) > 5
+    missing = [words for words in named if not any(title.startswith(words) for title in titles)]
+    assert not missing
 
 
 def test_the_version_is_one():

@@ -174,10 +174,10 @@ def test_flags_of_edits_are_checked(options, message):
         ({"floaters": 1.5}, "floaters must be a number from 0 to 1; got 1.5"),
         ({"floaters": True}, "floaters must be a number"),
         ({"crop": [1]}, "crop must be an object"),
-        ({"crop": {"low": [1, 2], "high": [None] * 3}}, "crop.low must be 3 numbers or null"),
+        ({"crop": {"low": [1, 2], "high": [None] * 3}}, "crop.low must be 3 finite numbers or null"),
         ({"crop": {"axes": [[1, 0, 0]] * 3, "low": [0] * 3, "high": [1] * 3}}, "crop.axes must have a rotation"),
         ({"up": [0, 0, 0]}, "up must not be zero"),
-        ({"background": [1, 2, None]}, "background must be 3 numbers"),
+        ({"background": [1, 2, None]}, "background must be 3 finite numbers"),
         ({"crops": {}}, "has the unknown entry crops"),
     ],
 )

@@ -33,7 +33,7 @@ CODE = re.compile(r"^```.*?^```|`[^`\n]*`|(?<=\])\([^)\s]*\)", re.DOTALL | re.MU
 
 def texts() -> Iterator[tuple[str, str]]:
     """All prose that users read, without code: (where, text)."""
-    for page in [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]:
+    for page in [ROOT / "README.md", ROOT / "experiments" / "NOTEBOOK.md", *(ROOT / "docs").rglob("*.md")]:
         yield page.name, page.read_text(encoding="utf-8")
     for path in (ROOT / "a2tg_jax").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

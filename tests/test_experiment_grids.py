@@ -6,7 +6,10 @@ import pathlib
 import re
 import subprocess
 import sys
+import time
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from experiment_records import CELL, record, result
@@ -15,8 +18,9 @@ from lab.cli import EXPERIMENTS, Lab, argument_parser
 from lab.fingerprint import fingerprint
 from lab.grid import Method, has_scale, read_grid, splats_in
 from lab.grid_file import GRIDS, SCALES, Block
-from lab.jobs import Folders, Job, step_seconds
+from lab.jobs import Folders, Job
 from lab.scenes import SceneAt, chosen_scenes, few_views, from_random_points, own_scene
+from lab.timing import TrainingTime
 from run import chosen, experiments, main, parse_arguments
 from test_data_transforms import write_blender
 
@@ -25,6 +29,8 @@ from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.training.terms import Term
 
 LARGE_SCALES = ("full", "full_size", "half_size", "long", "paper160")
+NEED_CHOICES = (("bytewise", "protocol"), ("claims", "claims"), ("confirmation", "claims"))
+"""Grids, at a scale, of which some methods are chosen for each scene by other runs."""
 NAMES = sorted(path.stem for path in GRIDS.glob("*.toml") if path.stem not in ("methods", "scales"))
 
 
@@ -33,7 +39,7 @@ NAMES = sorted(path.stem for path in GRIDS.glob("*.toml") if path.stem not in ("
     [
         pytest.param(name, scale, marks=pytest.mark.long if scale in LARGE_SCALES else ())
         for name, scale in itertools.product(NAMES, SCALES)
-        if has_scale(name, scale) and (name, scale) != ("bytewise", "protocol")  # It needs choices.
+        if has_scale(name, scale) and (name, scale) not in NEED_CHOICES
     ],
 )
 def test_every_grid_names_runs_that_can_be_trained(name, scale):
@@ -476,8 +482,8 @@ def test_bytes_for_each_pixel_are_a_budget_or_a_number_of_gaussians():
 def test_a_method_of_equal_time_has_the_iterations_that_fill_the_time_of_the_reference():
     grid = read_grid("bytewise", "smoke")
     reference, plain = grid.jobs({})
-    found = {job.key: record(step_seconds=seconds) for job, seconds in ((reference, 12.0), (plain, 4.0))}
-    found |= {job.start.key: record(step_seconds=seconds) for job, seconds in ((reference, 6.0), (plain, 2.0))}
+    found = {job.key: record(training_seconds=seconds) for job, seconds in ((reference, 12.0), (plain, 4.0))}
+    found |= {job.start.key: record(training_seconds=seconds) for job, seconds in ((reference, 6.0), (plain, 2.0))}
     (run,) = (run for run in grid.runs(found) if run.equal)
     assert run.label == "2DGS*-MCMC, degree 0, equal time" and run.job.all_iterations == (90, 60)
 
@@ -493,11 +499,24 @@ def test_few_views_are_folds_of_small_captures_and_parts_of_others(num, kept, sc
         assert len({view.name for fold in folds for view in fold.test}) == num
 
 
-def test_the_time_of_steps_leaves_compilation_out():
-    iteration = np.arange(10, 310, 10)
-    seconds = 0.02 * iteration + 5.0 * (iteration >= 100)  # A program is compiled before the 100th iteration.
-    history = dataclasses.replace(a2tg.History.empty(), iteration=iteration, seconds=seconds)
-    assert step_seconds(history) == pytest.approx(6.0)
+def test_training_time_leaves_compilation_out():
+    """A function that is compiled within the block, and one that is not."""
+
+    @jax.jit
+    def slow_to_compile(values):
+        for _ in range(400):
+            values = jnp.sin(values) * 1.01
+        return values
+
+    values = jnp.zeros(8)
+    start = time.process_time()
+    with TrainingTime(earlier=100.0) as training:
+        slow_to_compile(values).block_until_ready()
+        whole = time.process_time() - start
+        begun = time.process_time()
+        while time.process_time() - begun < 0.3:
+            pass
+    assert 0.3 <= training.seconds - 100.0 < 0.3 + 0.5 * whole
 
 
 def test_a_random_start_is_grey_points_in_the_cube_of_an_object(tmp_path):

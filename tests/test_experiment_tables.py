@@ -8,6 +8,7 @@ import shutil
 from types import SimpleNamespace
 
 import choose_plain
+import claims
 import efficiency
 import findings
 import numpy as np
@@ -176,7 +177,8 @@ def test_a_page_shows_the_tables_that_it_names(tmp_path, monkeypatch):
 
 
 RESULTS = EXPERIMENTS.parent / "docs" / "results.md"
-MADE_OF_MODELS = {"decomposition", "efficiency", "comparison_pictures"}
+NOTEBOOK = EXPERIMENTS / "NOTEBOOK.md"
+MADE_OF_MODELS = {"efficiency"}
 
 
 @pytest.mark.parametrize("scale", ["small", "long", "protocol"])
@@ -238,7 +240,7 @@ def test_the_chosen_plain_methods_are_those_of_the_committed_validation_records(
     records = read_kept(EXPERIMENTS / "results" / "protocol-validation" / "records.json")
     grid = read_grid("choose_plain", "protocol", validation=True)
     best = choose_plain.best_methods(tables.results_of(grid, records), 1 + len(grid.methods))
-    assert best == json.loads(choose_plain.FILE.read_text(encoding="utf-8"))
+    assert best == json.loads(choose_plain.FILES["protocol"].read_text(encoding="utf-8"))
 
 
 def test_pages_show_the_committed_tables():
@@ -264,6 +266,21 @@ def test_figures_in_sentences_on_results_are_in_tables():
     assert not missing, f"{missing} are in no table"
 
 
+def test_intervals_in_sentences_of_the_notebook_are_in_tables():
+    """In sections that show or link to tables, except for what was measured before the protocol."""
+    shown = " ".join(path.read_text(encoding="utf-8") for path in (EXPERIMENTS / "results" / "protocol").glob("*.md"))
+    interval = r"\d\.\d{2,} ± \d\.\d{2,}"
+    found = set()
+    for section in NOTEBOOK.read_text(encoding="utf-8").split("\n## "):
+        if "<!-- results/protocol/" in section or "(#all-intervals-and-captures)" in section:
+            sentences = pages.BLOCK.sub("", section)
+            sentences = re.sub(r"^- \*\*Before the protocol\*\*.*?(?=^- |^$)", "", sentences, flags=re.DOTALL | re.M)
+            found |= set(re.findall(interval, " ".join(sentences.split())))
+    assert len(found) > 10
+    missing = found - set(re.findall(interval, shown))
+    assert not missing, f"{missing} are in no table"
+
+
 def gains_in_the_paper():
     """PSNR of A²TG − 2DGS*-MCMC in each memory and data set of the paper's Table 1."""
     psnr = {(row["method"], row["dataset"], row["budget_mb"]): row["psnr"] for row in tables.PAPER["fixed_memory"]}
@@ -273,3 +290,42 @@ def gains_in_the_paper():
 
 def test_the_results_page_is_short():
     assert len(RESULTS.read_text(encoding="utf-8").split()) <= 1_300
+
+
+def test_the_notebook_is_read_in_one_sitting():
+    """It has at most 4,500 words besides generated tables, and its contents are the titles of its sections."""
+    text = re.sub(r"^<!-- \S+ -->$.*?^<!-- end -->$", "", NOTEBOOK.read_text(encoding="utf-8"), flags=re.DOTALL | re.M)
+    assert len(text.split()) <= 4_500
+    contents = text.split("\n# ")[1]
+    assert re.findall(r"^- \[(.*)\]\(#", contents, re.MULTILINE) == re.findall(r"^## (.*)$", text, re.MULTILINE)
+
+
+def claims_result(capture, label, psnr, budget=0.3, equal="", **others):
+    """Return a run of one view of a capture."""
+    found = result(label, psnr, equal=equal, **others)
+    cell = dataclasses.replace(CELL, scene=SceneAt(capture, capture), budget=budget)
+    return dataclasses.replace(found, run=dataclasses.replace(found.run, cell=cell))
+
+
+def test_registered_endpoints_are_decided_by_interval_and_corrected_p_value():
+    """Nine captures: gains of PSNR on all, none of LPIPS; and one capture that nothing was tuned on."""
+    results = []
+    for index in range(9):
+        capture, wobble = f"capture {index}", 0.1 * index
+        results += [
+            claims_result(capture, claims.BYTEWISE, 26.0 + wobble, training_seconds=10.0),
+            claims_result(capture, claims.STRONGEST, 25.0 + 2 * wobble),
+            claims_result(capture, claims.STRONGEST, 25.0, equal="time", training_seconds=10.5),
+        ]
+    unseen = [
+        claims_result("alexander", claims.BYTEWISE, 30.0),
+        claims_result("alexander", claims.STRONGEST, 30.5, equal="time"),
+    ]
+    rows = [line.split(" | ") for line in claims.endpoints_table(results, unseen).splitlines()]
+    assert rows[0][-1] == "alexander |"
+    primary, iterations, lpips = rows[2:]
+    # 2 of 2^9 sign flips are as far from 0; the smaller of two secondary p-values counts twice.
+    assert primary[:1] + primary[3:] == ["| primary", "+1.40 ± 0.21", "9/9", ".004", "**decided**", "-0.50 |"]
+    assert iterations[:1] + iterations[3:] == ["| secondary", "+0.60 ± 0.21", "9/9", ".008", "**decided**", "– |"]
+    assert lpips[3:] == ["+0.000 ± 0.000", "0/9", "1.000", "undecided", "+0.000 |"]
+    assert claims.times_text(results).startswith("The last stages of equal time took 1.05 to 1.05 times as long")

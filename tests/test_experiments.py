@@ -44,8 +44,11 @@ def test_a_stage_stops_at_its_time_and_is_timed_only_if_it_ran_alone(tmp_path, m
     system = a2tg.find_system("gaussians-2d-mcmc").preset("smoke", stage1_iterations=20, stage2_iterations=0)
     job, folders = Job("synthetic", 1, system, 0), Folders(tmp_path, tmp_path)
     assert run_job(job, folders, stop_at=time.monotonic()) is None
+    assert json.loads(folders.time_so_far(job).read_text()) >= 0
     assert folders.checkpoint(job).is_file() and not folders.model(job).is_file() and not folders.record(job).is_file()
+    folders.time_so_far(job).write_text("1000000.0")
     alone = run_job(job, folders)
+    assert 1e6 < alone["training_seconds"] < 1e6 + 600 and not folders.time_so_far(job).exists()
     assert alone["alone"] and alone["device"] and all(alone[name] is not None for name in TIMES)
     assert not folders.checkpoint(job).is_file()
     again = dataclasses.replace(job, system=dataclasses.replace(system, seed=1))

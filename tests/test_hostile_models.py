@@ -249,7 +249,7 @@ def test_files_with_numbers_that_are_too_large(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("kind", ["device", "pipe", "sparse"])
 def test_models_that_are_no_files(tmp_path, kind):
-    others = [(f"m{suffix}", a2tg.load_splats) for suffix in (".spz", ".sog", ".splat", ".ksplat", ".glb", ".pt")]
+    others = [(f"m{suffix}", a2tg.load_splats) for suffix in (".spz", ".sog", ".splat", ".ksplat", ".glb")]
     for name, load in (("m.npz", load_model), ("m.a2tgz", load_compact), ("m.ply", load_ply), *others):
         put(tmp_path / name, kind)
         refused(load, tmp_path / name, "is not a regular file" if kind != "sparse" else "has 100,000,000,000 bytes")

@@ -98,6 +98,9 @@ COMMANDS = {
     f"{NEW} --test-every -1": "--test-every … got -1",
     # Places and files
     "train nowhere --out new": "nowhere",
+    "train s3://me:secret@bucket/fox --out new": "s3://…: is a URL; mount the bucket (rclone mount)",
+    "train synthetic --out=s3://bucket/new": "s3://…: is a URL; mount the bucket (rclone mount)",
+    "sfm https://host/fox?sig=secret out": "https://…: is a URL; mount the bucket (rclone mount)",
     "train photos --out new": "a2tg sfm photos SCENE",
     "train bad.toml --out new": "bad.toml … transforms.json … Metashape",
     "train synthetic --out bad.toml/run": "run cannot be made",
@@ -447,6 +450,8 @@ CALLS = {
     "save_ply('x.a2tgz', MODEL)": "*.ply … save_compact",
     "load_model('flat.ply')": "flat.ply … *.npz … load_ply",
     "load_model('/')": "folder … file",
+    "load_scene('s3://me:secret@bucket/fox')": "s3://…: is a URL; mount the bucket (rclone mount)",
+    "load_scene(5)": "a path must be text or a Path; got 5",
     "load_scene('synthetic')": "synthetic … no such scene folder … synthetic_scene()",
     "load_scene('cells')": "cells … no such scene folder … cells_scene()",
     # Points

@@ -16,7 +16,7 @@ from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.decoding import picture_facts
 from a2tg_jax.data.load import load_scene
 from a2tg_jax.data.panoramas import projection_of
-from a2tg_jax.data.staging import cut_view, directions, is_panorama, view_size
+from a2tg_jax.data.staging import cut_view, directions, view_size
 
 CENTER = np.array([0.3, -1.2, 1.2])
 WIDTH, FACE = 640, 224
@@ -119,7 +119,7 @@ WHOLE = {
 
 @pytest.mark.parametrize("name", WHOLE)
 def test_panoramas_are_recognised(panorama, name):
-    assert is_panorama(np.rint(WHOLE[name](panorama)).astype(np.uint8))
+    assert projection_of(np.rint(WHOLE[name](panorama)).astype(np.uint8)) == "panorama"
 
 
 def flat(own, left=100, top=80):
@@ -167,7 +167,7 @@ OTHERS = {
 def test_other_pictures_are_not_taken_for_panoramas(panorama, name):
     kind, change = OTHERS[name]
     pixels = np.rint(change(panorama)).astype(np.uint8)
-    assert not is_panorama(pixels)
+    assert projection_of(pixels) != "panorama"
     assert kind is None or projection_of(pixels) == kind
 
 

@@ -280,7 +280,10 @@ def of_pictures() -> dict[str, tuple[bytes, str]]:
 def of_headers() -> dict[str, tuple[bytes, str]]:
     counts = (0, -1, 1.5, "90", 97, 5000, 10**30, True, None, [90])
     count_of = lambda value: header_with(lambda h: h.update(count=value))  # noqa: E731
-    found = {f"count {value!r}": (count_of(value), "count of splats|too few for|is too large") for value in counts}
+    found = {
+        f"count {value!r}": (count_of(value), "number of splats in meta.json must be an int|too few for|is too large")
+        for value in counts
+    }
     changes = {
         "no count": (lambda h: h.pop("count"), "lacks 'count'"),
         "version 3": (lambda h: h.update(version=3), "is SOG of version 3"),
@@ -290,11 +293,11 @@ def of_headers() -> dict[str, tuple[bytes, str]]:
         "no scales": (lambda h: h.pop("scales"), "describes no scales"),
         "list of quats": (lambda h: h.update(quats=[]), "describes no quats"),
         "text of shN": (lambda h: h.update(shN="x"), "describes no shN"),
-        "two mins": (lambda h: h["means"]["mins"].pop(), "means.mins of meta.json must be 3 numbers; got 2"),
-        "no maxs": (lambda h: h["means"].pop("maxs"), "means.maxs of meta.json must be finite numbers"),
-        "text in mins": (lambda h: h["means"].update(mins=["0", 0, 0]), "means.mins of meta.json must be finite"),
+        "two mins": (lambda h: h["means"]["mins"].pop(), "means.mins of meta.json must be 3 finite numbers"),
+        "no maxs": (lambda h: h["means"].pop("maxs"), "means.maxs of meta.json must be 3 finite numbers"),
+        "text in mins": (lambda h: h["means"].update(mins=["0", 0, 0]), "means.mins of meta.json must be 3 finite"),
         "NaN in mins": (lambda h: h["means"].update(mins=[float("nan"), 0, 0]), "meta.json cannot be read as JSON"),
-        "large maxs": (lambda h: h["means"].update(maxs=[1e300, 0, 0]), "means.maxs of meta.json must be finite"),
+        "large maxs": (lambda h: h["means"].update(maxs=[1e300, 0, 0]), "means.maxs of meta.json must be 3 finite"),
         "infinite positions": (
             lambda h: h["means"].update(mins=[1e5] * 3, maxs=[2e5] * 3),
             "gaussians.means must be finite",
@@ -302,14 +305,14 @@ def of_headers() -> dict[str, tuple[bytes, str]]:
         "short codebook": (lambda h: h["scales"].update(codebook=[0.0] * 9), "scales.codebook of meta.json has 9"),
         "codebook of nulls": (
             lambda h: h["sh0"].update(codebook=[None] * 256),
-            "sh0.codebook of meta.json must be fin",
+            "sh0.codebook of meta.json must be a list of fin",
         ),
         "no codebook": (lambda h: h["sh0"].pop("codebook"), "sh0.codebook of meta.json must be a list"),
         "empty codebook": (lambda h: h["sh0"].update(codebook=[]), "sh0.codebook of meta.json must be a list"),
         "text codebook": (lambda h: h["sh0"].update(codebook="x" * 256), "sh0.codebook of meta.json must be a list"),
         "infinite codebook": (
             lambda h: h["shN"].update(codebook=[1e39] * 256),
-            "shN.codebook of meta.json must be fin",
+            "shN.codebook of meta.json must be a list of fin",
         ),
         "no files": (lambda h: h["quats"].pop("files"), "must name 1 pictures of quats; got None"),
         "one file of means": (lambda h: h["means"]["files"].pop(), "must name 2 pictures of means"),
@@ -323,9 +326,9 @@ def of_headers() -> dict[str, tuple[bytes, str]]:
         "no bands": (lambda h: h["shN"].pop("bands"), "lacks 'bands'"),
         "many sets": (lambda h: h["shN"].update(count=10**9), "shN_centroids.webp holds 64 sets"),
         "few sets": (lambda h: h["shN"].update(count=3), r"shN_labels.webp refers to set \d+"),
-        "offset": (lambda h: h.update(offset=[1, 2]), "offset of meta.json must be 3 numbers"),
+        "offset": (lambda h: h.update(offset=[1, 2]), "offset of meta.json must be 3 finite numbers"),
         "large offset": (lambda h: h.update(offset=[1e30, 0, 0]), "origin.transform"),
-        "rotation": (lambda h: h.update(rotation="none"), "rotation of meta.json must be finite numbers"),
+        "rotation": (lambda h: h.update(rotation="none"), "rotation of meta.json must be 4 finite numbers"),
     }
     return found | {name: (header_with(change), reason) for name, (change, reason) in changes.items()}
 

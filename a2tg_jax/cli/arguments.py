@@ -5,16 +5,22 @@ import inspect
 import os
 import types
 import typing
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import tyro
 from docstring_parser import parse_from_object
 from tyro.conf import Positional, arg
-from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+from tyro.constructors import (
+    ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+    StructConstructorSpec,
+    StructTypeInfo,
+)
 
-from a2tg_jax.host.remote_files import is_url, without_secrets
+from a2tg_jax.host.regular_files import expanded
 from a2tg_jax.host.text import defaulting_to
 
 Parsed = TypeVar("Parsed")
@@ -43,7 +49,17 @@ LpipsWeights = Annotated[
 ]
 
 
-def parse(kind: type[Parsed], program: str, arguments: Sequence[str], default: Parsed | None = None) -> Parsed:
+Rule = Callable[[StructTypeInfo], StructConstructorSpec | None]
+"""Function that returns how tyro fills a class, or None for other classes."""
+
+
+def parse(
+    kind: type[Parsed],
+    program: str,
+    arguments: Sequence[str],
+    default: Parsed | None = None,
+    rule: Rule | None = None,
+) -> Parsed:
     """Parse arguments into an instance of a dataclass.
 
     Args:
@@ -51,6 +67,7 @@ def parse(kind: type[Parsed], program: str, arguments: Sequence[str], default: P
       program: name of the command in the help.
       arguments: arguments without the command's name.
       default: values of the options that are not given; None: the dataclass's own.
+      rule: rule for a class in it that knows no command line.
 
     Raises:
       SystemExit: after help (code 0) or an error (code 2), which tyro has printed.
@@ -60,17 +77,17 @@ def parse(kind: type[Parsed], program: str, arguments: Sequence[str], default: P
         _fill_help(default or kind)
     rules = ConstructorRegistry()
     rules.primitive_rule(_optional_rule)
+    if rule is not None:
+        rules.struct_rule(rule)
     about = inspect.getdoc(kind) or ""
     given: dict[str, Any] = {}
     if default is not None:
         about = about.split("\n")[0]  # The other lines are the short help.
         given["default"] = default
     command: Parsed = tyro.cli(kind, prog=program, args=arguments, description=about, registry=rules, **given)
-    scene = getattr(getattr(getattr(command, "record", None), "scene", None), "path", None)
     for word in arguments:
-        text = word.partition("=")[2] if word.startswith("--") else word
-        if text != scene:
-            check_path(text)
+        # Raises ValueError for a URL, which would name a folder of this machine.
+        expanded(word.partition("=")[2] if word.startswith("--") else word)
     return command
 
 
@@ -78,13 +95,6 @@ def at_home(word: str) -> str:
     """Return an argument with the home folder for a leading ~, also in --out=~/x, where shells leave it."""
     flag, equals, text = word.partition("=") if word.startswith("--") else ("", "", word)
     return flag + equals + os.path.expanduser(text)
-
-
-def check_path(text: str) -> None:
-    """Raise ValueError if a path is a URL, which would name a folder of this machine."""
-    if is_url(text):
-        url = without_secrets(text)
-        raise ValueError(f"{url}: only SCENE of a2tg train may be a URL; copy it here, or mount the bucket")
 
 
 def _fill_help(value: Any) -> None:

@@ -163,13 +163,13 @@ def parsed(name: str, arguments: Sequence[str]) -> Any:
 
     arguments = [at_home(word) for word in arguments]
     kind = command_class(name)
-    default = None
-    if name == "train":
-        from a2tg_jax.cli.train import train_defaults
+    program = f"a2tg {name}"
+    words = ["--help" if word == "--help-all" else word for word in arguments]
+    if name != "train":
+        return parse(kind, program, words)
+    from a2tg_jax.cli.train import scene_rule, train_defaults
 
-        default = train_defaults(arguments)
-    arguments = ["--help" if word == "--help-all" else word for word in arguments]
-    return parse(kind, f"a2tg {name}", arguments, default)
+    return parse(kind, program, words, train_defaults(arguments), scene_rule)
 
 
 def _fail(message: str) -> int:

@@ -300,9 +300,8 @@ class Convert:
     """Convert splats between formats, chosen by the suffixes of the files.
 
     Reads and writes *.npz, *.a2tgz, *.ply, *.compressed.ply, *.spz, *.sog, *.splat, *.ksplat, *.glb, *.gltf, *.usda,
-    *.usdc, *.usdz, and checkpoints of gsplat (*.pt, *.pth) and Nerfstudio (*.ckpt). Also reads checkpoints of 3DGS and
-    2DGS. Gaussians of 3DGS are flattened along their thinnest axis. Files of other programs are upright, with the
-    original units.
+    *.usdc and *.usdz. Also writes checkpoints of gsplat (*.pt, *.pth) and Nerfstudio (*.ckpt). Gaussians of 3DGS are
+    flattened along their thinnest axis. Files of other programs are upright, with the original units.
 
     Other programs support no textures, and no kernels but Gaussians. --bake turns a textured splat into plain ones, as
     many as its texels or fewer, and trains them on pictures of the model from its training cameras. The photographs

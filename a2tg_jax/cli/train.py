@@ -9,19 +9,21 @@ import webbrowser
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, get_type_hints
 
 import jax
 import tyro
-from tyro.conf import arg
+from tyro.conf import Positional, arg
+from tyro.constructors import StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
 from a2tg_jax.adapt import Upscale
-from a2tg_jax.cli.arguments import LpipsWeights, check_path
+from a2tg_jax.cli.arguments import LpipsWeights
 from a2tg_jax.core.budget import budget_in_bytes
 from a2tg_jax.data.load import SceneSource
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.host.machine import tidy_memory
 from a2tg_jax.host.operating_system import has_display
+from a2tg_jax.host.regular_files import expanded
 from a2tg_jax.host.text import counted, defaulting_to
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.mcmc import Mcmc
@@ -289,8 +291,8 @@ def train_defaults(arguments: Sequence[str]) -> Train:
       ValueError, FileNotFoundError: if there is no such system, preset, file or run, or it is invalid.
     """
     found, _ = tyro.cli(DecidingOptions, prog="a2tg train", args=arguments, return_unknown_args=True, add_help=False)
-    check_path(found.config)
-    check_path(found.out)
+    for path in (found.config, found.out):
+        expanded(path)  # Raises ValueError for a URL.
     record = RunRecord(SceneSource())
     if found.resume and found.config:
         raise ValueError("--resume takes every option from the run folder: leave out --config")
@@ -308,6 +310,19 @@ def train_defaults(arguments: Sequence[str]) -> Train:
     # MISSING makes SCENE required in tyro.
     scene = record.scene if record.scene.path else dataclasses.replace(record.scene, path=tyro.MISSING)
     return Train(dataclasses.replace(record, scene=scene), tyro.MISSING)
+
+
+def scene_rule(info: StructTypeInfo) -> StructConstructorSpec | None:
+    """Return the options of a scene's source, with its path as the argument SCENE; None for other classes."""
+    if info.type is not SceneSource:
+        return None
+    kinds = get_type_hints(SceneSource)
+    kinds["path"] = Annotated[Positional[str], arg(metavar="SCENE")]
+    fields = []
+    for field in dataclasses.fields(SceneSource):
+        default = getattr(info.default, field.name, field.default)
+        fields.append(StructFieldSpec(field.name, kinds[field.name], default, field.metadata.get("help")))
+    return StructConstructorSpec(SceneSource, tuple(fields))
 
 
 def defaults_line(arguments: Sequence[str]) -> str:

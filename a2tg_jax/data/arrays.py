@@ -15,7 +15,6 @@ from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.data.assembly import (
     PointCloud,
     Shot,
-    Sight,
     are_somewhere,
     assemble_scene,
     check_test_every,
@@ -31,11 +30,13 @@ OFF_CENTER = 1.25
 """Smallest ratio between image size and twice the principal point, on both axes, that gives a warning."""
 MOST_COMPARED = 100
 """Number of views that are tested with other conventions; ten times as many points are."""
-LEAST_SEEN, CLEARLY = 0.05, 1.5
+LEAST_SEEN = 0.05
+CLEARLY = 1.5
 """Smallest share of points in view by another convention, and its smallest ratio to the share by the given one."""
 PRECISIONS = 0.2, 0.01
 """Largest offset of an axis from the common point, relative to its distance, for photographs and for renders."""
-SUBJECT, NUM_TRIED = 0.6, 20_000
+SUBJECT = 0.6
+NUM_TRIED = 20_000
 """Half the side of the cube around the common point, in units of the cameras' distance, in which photographs are
 compared at random points, and their number."""
 MOST_DIFFERENCE = 0.9
@@ -114,21 +115,20 @@ def scene_from_arrays(
         raise ValueError("colors needs points")
     cloud = None if points is None else _cloud(points, colors)
 
-    def shot(index: int) -> Shot:
-        own = f"{index:04d}" if names is None else names[index]
-        check_kind(f"names[{index}]", own, str)
+    shots = []
+    for index in range(num):
+        view_name = f"{index:04d}" if names is None else names[index]
+        check_kind(f"names[{index}]", view_name, str)
         picture = _converted(f"images[{index}]", Picture.of, images[index])
         viewmat = rigid_viewmat(viewmats[index], f"viewmats[{index}]")
         height, width = picture.size
         check_intrinsics(Ks[index], width, height, f"Ks[{index}]")
-        mask, depth = (
-            None if values is None or values[index] is None
-            else _converted(f"{argument}[{index}]", kind, values[index], picture.size)
-            for argument, values, kind in (("masks", masks, Mask.of), ("depths", depths, DepthMap.of))
-        )  # fmt: skip
-        return Shot(own, viewmat, Ks[index], picture, mask, depth=depth)
-
-    shots = [shot(index) for index in range(num)]
+        mask = depth = None
+        if masks is not None and masks[index] is not None:
+            mask = _converted(f"masks[{index}]", Mask.of, masks[index], picture.size)
+        if depths is not None and depths[index] is not None:
+            depth = _converted(f"depths[{index}]", DepthMap.of, depths[index], picture.size)
+        shots.append(Shot(view_name, viewmat, Ks[index], picture, mask, depth=depth))
     for message in _mistakes(images, colors, shots, None if cloud is None else cloud.points):
         warnings.warn(f"the scene {name}: {message}", stacklevel=2)
     scene = assemble_scene(name, *every_kth(shots, test_every), cloud, source=f"the scene {name}")
@@ -143,9 +143,11 @@ def _mistakes(
     # Colours in [0, 1] cast to uint8 are only 0 and 1. The first image usually settles it.
     pairs = zip(images, shots, strict=True)
     arrays = {"images": [shot.picture.read() for image, shot in pairs if not isinstance(image, Picture)]}
-    for name, own in (arrays | ({} if colors is None else {"colors": [np.asarray(colors)]})).items():
+    if colors is not None:
+        arrays["colors"] = [np.asarray(colors)]
+    for name, of_name in arrays.items():
         largest = 0
-        for array in own:
+        for array in of_name:
             largest = max(largest, int(np.max(array[..., :3], initial=0)))
             if largest > 1:
                 break
@@ -157,7 +159,8 @@ def _mistakes(
     is_off = (np.maximum(twice, sizes) > OFF_CENTER * np.minimum(twice, sizes)).all(axis=1)
     if np.count_nonzero(is_off) > len(shots) / 2:
         first = int(np.argmax(is_off))
-        (width, height), (of_width, of_height) = sizes[first], twice[first]
+        width, height = sizes[first]
+        of_width, of_height = twice[first]
         yield (
             f"Ks do not fit the images: {np.count_nonzero(is_off)} of {len(shots)} principal points are far from the "
             f"middle; Ks[{first}] would fit {of_width:g} × {of_height:g} pixels, but the image has {width:g} × "
@@ -186,18 +189,22 @@ def _likelier_poses(shots: Sequence[Shot], points: np.ndarray | None) -> str:
     }
     if points is not None and len(points):
         some = evenly_chosen(points, 10 * MOST_COMPARED)
-        own, *found = (_share_seen(chosen, viewmats, some) for viewmats in (given, *others.values()))
-        best = int(np.argmax(found))
-        if found[best] < LEAST_SEEN or own * CLEARLY > found[best]:
+        share = _share_seen(chosen, given, some)
+        shares = [_share_seen(chosen, viewmats, some) for viewmats in others.values()]
+        best = int(np.argmax(shares))
+        if shares[best] < LEAST_SEEN or share * CLEARLY > shares[best]:
             return ""
-        return f"the views see {own:.0%} of the points, and would see {found[best]:.0%} with {[*others][best]}"
+        return f"the views see {share:.0%} of the points, and would see {shares[best]:.0%} with {[*others][best]}"
     for precision in PRECISIONS:
-        own, *found = (_share_that_meet(viewmats, precision) for viewmats in (given, *others.values()))
-        best = int(np.argmax(found[:2]))
-        if found[2] >= 0.9 and own <= 0.5 and _agree_on_subject(chosen, flip @ given):
+        share = _share_that_meet(given, precision)
+        shares = [_share_that_meet(viewmats, precision) for viewmats in others.values()]
+        if share > 0.5:
+            continue
+        best = int(np.argmax(shares[:2]))
+        if shares[2] >= 0.9 and _agree_on_subject(chosen, flip @ given):
             best = 2
-        if own <= 0.5 and found[best] >= 0.9:
-            return f"{own:.0%} of the cameras look at one place, and {found[best]:.0%} would with {[*others][best]}"
+        if shares[best] >= 0.9:
+            return f"{share:.0%} of the cameras look at one place, and {shares[best]:.0%} would with {[*others][best]}"
     return ""
 
 
@@ -211,29 +218,30 @@ def _agree_on_subject(shots: Sequence[Shot], viewmats: np.ndarray) -> bool:
     subject = nearest_point(centers, viewmats[:, 2, :3])
     half_side = SUBJECT * np.median(np.linalg.norm(centers - subject, axis=1))
     points = subject + half_side * np.random.default_rng(0).uniform(-1, 1, (NUM_TRIED, 3))
-    own = agreement(looks, points)
+    difference = agreement(looks, points)
     exchanged = []
     for shift in {1, len(looks) // 3, len(looks) // 2, len(looks) - 1} - {0}:
         for look, viewmat in zip(looks, np.roll(viewmats, shift, axis=0), strict=True):
             look.viewmat = viewmat
         exchanged.append(agreement(looks, points))
-    return own < MOST_DIFFERENCE * min(exchanged)
+    return difference < MOST_DIFFERENCE * min(exchanged)
 
 
 def _share_seen(shots: Sequence[Shot], viewmats: np.ndarray, points: np.ndarray) -> float:
     """Return the share of all points, averaged over the views, in an image."""
-    pairs = zip(shots, viewmats, strict=True)
-    sights = [Sight.of(viewmat, shot.K, shot.picture.size, None) for shot, viewmat in pairs]
+    sights = [shot.sight(viewmat) for shot, viewmat in zip(shots, viewmats, strict=True)]
     return float(np.mean([sight.num_seen(points, 0.0) for sight in sights])) / len(points)
 
 
 def _share_that_meet(viewmats: np.ndarray, precision: float) -> float:
     """Return the share of cameras that look at the point nearest to all axes, to `precision` times its distance."""
-    centers, axes = camera_centers(viewmats), viewmats[:, 2, :3]
+    centers = camera_centers(viewmats)
+    axes = viewmats[:, 2, :3]
     offsets = nearest_point(centers, axes) - centers
     depths = np.sum(offsets * axes, axis=1)
     # The axes are unit vectors, so |offset × axis| is the distance from the point to the axis.
-    return float(np.mean((depths > 0) & (np.linalg.norm(np.cross(offsets, axes), axis=1) < precision * depths)))
+    distances = np.linalg.norm(np.cross(offsets, axes), axis=1)
+    return float(np.mean((depths > 0) & (distances < precision * depths)))
 
 
 def _numbers(name: str, values: ArrayLike) -> np.ndarray:
@@ -244,8 +252,8 @@ def _numbers(name: str, values: ArrayLike) -> np.ndarray:
             return np.asarray(values, np.float64)
     except (TypeError, ValueError):
         pass
-    found = described(values) if hasattr(values, "dtype") else kind_of(values)
-    raise ValueError(f"{name} must be an array of real numbers; got {found}")
+    got = described(values) if hasattr(values, "dtype") else kind_of(values)
+    raise ValueError(f"{name} must be an array of real numbers; got {got}")
 
 
 def _converted(name: str, kind: Callable[[Any], Any], values: object, size: tuple[int, int] | None = None) -> Any:

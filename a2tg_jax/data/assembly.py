@@ -25,15 +25,17 @@ from a2tg_jax.data.scene import Scene, View
 from a2tg_jax.host.text import counted, first_names
 
 NUM_POINTS = 10_000
-"""Most points that a scene without any gets, but for more in views that would see none."""
+"""Number of points made for a scene without any. Views that see none of these get further ones."""
 NUM_CANDIDATES = 100_000
-"""Random points among which these are chosen."""
+"""Number of random points among which they are chosen."""
 OBJECT_SHARE = 0.8958
 """Half the side of an object's cube over half the width that cameras see at its centre: the cube of ±1.3 of NeRF's
 synthetic objects, whose cameras are 4.031 away and see 39.6°."""
-NEAREST, DEEPEST_AROUND = 0.4, 2.0
+NEAREST = 0.4
+DEEPEST_AROUND = 2.0
 """Depths of random points in front of cameras around a subject, in units of their distance from it."""
-SHALLOWEST, DEEPEST = 0.5, 10.0
+SHALLOWEST = 0.5
+DEEPEST = 10.0
 """Depths of random points in front of other cameras."""
 FIRST_LOOK = 10_000
 """Number of evenly chosen points that a view is tested with first."""
@@ -68,6 +70,10 @@ class Shot:
     depth: DepthMap | None = None
     panorama: int | None = None
 
+    def sight(self, viewmat: np.ndarray) -> "Sight":
+        """Return what it shows from a pose [4, 4] in any world."""
+        return Sight.of(viewmat, self.K, self.picture.size, self.rays)
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PointCloud:
@@ -101,40 +107,17 @@ def assemble_scene(
     # Sorted for _check_shots, and so that sums over cameras do not depend on the order of the files.
     shots = sorted([*train, *test], key=lambda shot: shot.name)
     _check_shots(shots, len(train), source)
-    is_outlying = _warn_of_outlying(shots, cloud, source)
+    poses = np.stack([shot.viewmat for shot in shots])
+    is_outlying = _warn_of_outlying(shots, poses, cloud, source)
     try:
-        transform = normalizing_similarity(np.stack([shot.viewmat for shot in shots])[~is_outlying])
+        transform = normalizing_similarity(poses[~is_outlying])
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
+    warn_of_rounding("camera positions", camera_centers(poses), transform, source)
     viewmats = {shot.name: transform.apply_to_viewmat(shot.viewmat) for shot in shots}
-    warn_of_rounding("camera positions", camera_centers(np.stack([shot.viewmat for shot in shots])), transform, source)
-    sights = [Sight.of(viewmats[shot.name], shot.K, shot.picture.size, shot.rays) for shot in train]
     if cloud is not None:
-        is_usable = are_somewhere(cloud.points)
-        # Again in the normalised world: its unit is small if the cameras are close together.
-        is_usable[is_usable] = are_somewhere(transform.apply(cloud.points[is_usable]))
-        if not is_usable.all():
-            left_out = counted(int(np.count_nonzero(~is_usable)), "point")
-            message = f"{source}: {left_out} left out, not finite or beyond ±{LARGEST_COORDINATE:g}"
-            warnings.warn(message, stacklevel=3)
-            cloud = PointCloud(cloud.points[is_usable], cloud.colors[is_usable])
-        warn_of_rounding("points", cloud.points, transform, source)
-    # Initial Gaussians are as large as the distances to their neighbours, so one point is not enough.
-    points = None if cloud is None or len(cloud.points) < 2 else transform.apply(cloud.points)
-    unseen_by = [] if points is None else unseeing(points, sights)
-    if cloud is None or points is None or len(unseen_by) == len(sights):
-        lacks = "has no" if points is None else "no training view sees any of its"
-        points, colors, obstacle = _start_without_points(
-            train, viewmats, sights, transform.rotation if is_object else None
-        )
-        if cloud is not None or obstacle or not is_object:
-            kind = f"random points, since {obstacle}" if obstacle else "points where photographs agree"
-            warnings.warn(f"{source}: {lacks} sparse points; starts from {len(points):,} {kind}", stacklevel=3)
-    else:
-        colors = cloud.colors
-        if unseen_by:
-            message = f"{source}: {len(unseen_by)} of {len(sights)} training views see none of its points, such as "
-            warnings.warn(f"{message}{train[unseen_by[0]].name}: nothing to start from there", stacklevel=3)
+        cloud = _usable_points(cloud, transform, source)
+    points, colors = _start(train, viewmats, cloud, transform, source, is_object)
     views = {shot.name: _view(shot, viewmats[shot.name]) for shot in shots}
     return Scene(
         name=name,
@@ -147,7 +130,7 @@ def assemble_scene(
     )
 
 
-def _warn_of_outlying(shots: Sequence[Shot], cloud: PointCloud | None, source: str) -> np.ndarray:
+def _warn_of_outlying(shots: Sequence[Shot], poses: np.ndarray, cloud: PointCloud | None, source: str) -> np.ndarray:
     """Return [V] bool, the shots whose cameras are far from all others, which a warning names."""
 
     def distance_of(indices: np.ndarray) -> float:
@@ -155,17 +138,15 @@ def _warn_of_outlying(shots: Sequence[Shot], cloud: PointCloud | None, source: s
         depths = []
         if cloud is not None:
             points = evenly_chosen(cloud.points[are_somewhere(cloud.points)], FIRST_LOOK)
-            for index in indices:
-                shot = shots[index]
-                seen = Sight.of(shot.viewmat, shot.K, shot.picture.size, shot.rays).depths_seen(points, 0.0)
+            for index in indices.tolist():
+                seen = shots[index].sight(poses[index]).depths_seen(points, 0.0)
                 if len(seen):
                     depths.append(np.median(seen))
-        return float(np.median(depths)) if depths else distance_to_subject(viewmats[indices])
+        return float(np.median(depths)) if depths else distance_to_subject(poses[indices])
 
-    viewmats = np.stack([shot.viewmat for shot in shots])
-    is_outlying = outlying_cameras(viewmats, distance_of)
+    is_outlying = outlying_cameras(poses, distance_of)
     if is_outlying.any():
-        names = [shot.name for shot, is_far in zip(shots, is_outlying, strict=True) if is_far]
+        names = [shots[index].name for index in np.flatnonzero(is_outlying).tolist()]
         warnings.warn(
             f"{source}: {counted(len(names), 'camera')} of {len(shots)} far from all others: {first_names(names)}. "
             "The others alone decide the world's origin and unit. If these poses are wrong, remove the photographs or "
@@ -175,18 +156,69 @@ def _warn_of_outlying(shots: Sequence[Shot], cloud: PointCloud | None, source: s
     return is_outlying
 
 
+def _usable_points(cloud: PointCloud, transform: Similarity, source: str) -> PointCloud:
+    """Return the points whose coordinates are finite and not too large; a warning counts the others."""
+    is_usable = are_somewhere(cloud.points)
+    # Again in the normalised world: its unit is small if the cameras are close together.
+    is_usable[is_usable] = are_somewhere(transform.apply(cloud.points[is_usable]))
+    if not is_usable.all():
+        left_out = counted(int(np.count_nonzero(~is_usable)), "point")
+        message = f"{source}: {left_out} left out, not finite or beyond ±{LARGEST_COORDINATE:g}"
+        warnings.warn(message, stacklevel=4)
+        cloud = PointCloud(cloud.points[is_usable], cloud.colors[is_usable])
+    warn_of_rounding("points", cloud.points, transform, source)
+    return cloud
+
+
+def _start(
+    train: Sequence[Shot], viewmats: Mapping[str, np.ndarray], cloud: PointCloud | None, transform: Similarity,
+    source: str, is_object: bool,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Return the points [P, 3] to start from, in the normalised world, and their colours [P, 3] uint8.
+
+    They are those of the cloud if training views see them. Warnings say if not all do, or where other points are from.
+    """
+    sights = [shot.sight(viewmats[shot.name]) for shot in train]
+    lacks = "has no"
+    # Initial Gaussians are as large as the distances to their neighbours, so one point is not enough.
+    if cloud is not None and len(cloud.points) > 1:
+        points = transform.apply(cloud.points)
+        blind = unseeing(points, sights)
+        if len(blind) < len(sights):
+            if blind:
+                message = f"{source}: {len(blind)} of {len(sights)} training views see none of its points, such as "
+                warnings.warn(f"{message}{train[blind[0]].name}: nothing to start from there", stacklevel=4)
+            return points, cloud.colors
+        lacks = "no training view sees any of its"
+    start = _start_without_points(train, viewmats, sights, transform.rotation if is_object else None)
+    if cloud is not None or start.obstacle or not is_object:
+        kind = f"random points, since {start.obstacle}" if start.obstacle else "points where photographs agree"
+        warnings.warn(f"{source}: {lacks} sparse points; starts from {len(start.points):,} {kind}", stacklevel=4)
+    return start.points, start.colors
+
+
+class _MadePoints(NamedTuple):
+    """Points of a scene that has none."""
+
+    points: np.ndarray  # [P, 3]
+    colors: np.ndarray  # [P, 3] uint8
+    obstacle: str  # Why they are random; "" if photographs agree there.
+
+
 def _start_without_points(
     train: Sequence[Shot], viewmats: Mapping[str, np.ndarray], sights: "Sequence[Sight]", object_axes: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray, str]:
-    """Return points [P, 3] where photographs agree, their colours [P, 3] uint8, and ""; or random grey ones, and why
-    there are no others. Each view sees some."""
+) -> _MadePoints:
+    """Return points where photographs agree, or random grey ones. Each view sees some."""
     random = random_points(sights, object_axes)
-    obstacle = ""
-    looks = _compared_photographs(train, viewmats)
+    # Photographs that validation holds out are not compared, unless there are no others.
+    kept = every_kth(train, VALIDATION_EVERY)[0] or train
+    compared = evenly_chosen([shot for shot in kept if shot.rays is None], MOST_VIEWS)
+    looks = [Look(shot.picture, shot.mask, viewmats[shot.name], shot.K) for shot in compared]
     points, colors = agreeing_points(looks, random, NUM_POINTS)
+    obstacle = ""
     if len(points) < 2:
-        points, colors = random[:NUM_POINTS], np.full((NUM_POINTS, 3), GREY)
-        obstacle = "the photographs agree nowhere"
+        points = random[:NUM_POINTS]
+        colors = np.full(points.shape, GREY)
         if not looks:
             obstacle = "photographs that keep a lens's distortion are not compared"
         elif plain_share(looks) > MOST_PLAIN:
@@ -194,18 +226,17 @@ def _start_without_points(
                 f"{plain_share(looks):.0%} of the photographs is plain, such as a wall or the sky, where they would "
                 "agree anywhere: give points of a reconstruction, such as a2tg sfm finds"
             )
-    elif lost := unseeing(points, sights):
-        # As many for each of them as for the others, at random.
-        more = random_points([sights[index] for index in lost])[: NUM_POINTS * len(lost) // len(sights)]
-        points, colors = np.concatenate([points, more]), np.concatenate([colors, np.full(more.shape, GREY)])
-    return points, np.rint(255 * colors).astype(np.uint8), obstacle
-
-
-def _compared_photographs(train: Sequence[Shot], viewmats: Mapping[str, np.ndarray]) -> list[Look]:
-    """Return photographs of pinhole cameras, evenly chosen, without those that validation holds out."""
-    pinholes = [shot for shot in every_kth(train, VALIDATION_EVERY)[0] or train if shot.rays is None]
-    compared = evenly_chosen(pinholes, MOST_VIEWS)
-    return [Look(shot.picture, shot.mask, viewmats[shot.name], shot.K) for shot in compared]
+        else:
+            obstacle = "the photographs agree nowhere"
+    else:
+        blind = unseeing(points, sights)
+        if blind:
+            # As many for each of them as for the others, at random.
+            num = NUM_POINTS * len(blind) // len(sights)
+            more = random_points([sights[index] for index in blind])[:num]
+            points = np.concatenate([points, more])
+            colors = np.concatenate([colors, np.full(more.shape, GREY)])
+    return _MadePoints(points, np.rint(255 * colors).astype(np.uint8), obstacle)
 
 
 class Sight(NamedTuple):
@@ -221,25 +252,27 @@ class Sight(NamedTuple):
     """[2] largest ones."""
 
     @staticmethod
-    def of(viewmat: np.ndarray, K: np.ndarray, size: tuple[int, ...], rays: ArrayLike | None) -> "Sight":
+    def of(viewmat: np.ndarray, K: np.ndarray, size: tuple[int, int], rays: ArrayLike | None) -> "Sight":
         """Return what a view of (height, width) shows, with `rays` as in `Camera.rays`."""
         if rays is None:
-            return Sight(viewmat, K, np.zeros(2), np.array(size[::-1], np.float64))
+            height, width = size
+            return Sight(viewmat, K, np.zeros(2), np.array([width, height], np.float64))
         # NaN: pixels without a ray.
         return Sight(viewmat, K, np.nanmin(rays, axis=(0, 1)), np.nanmax(rays, axis=(0, 1)))
 
     @staticmethod
     def of_camera(camera: Camera) -> "Sight":
         """Return what a camera shows."""
-        viewmat, K = np.asarray(camera.viewmat, np.float64), np.asarray(camera.K, np.float64)
-        return Sight.of(viewmat, K, (camera.height, camera.width), camera.rays)
+        viewmat = np.asarray(camera.viewmat, np.float64)
+        return Sight.of(viewmat, np.asarray(camera.K, np.float64), (camera.height, camera.width), camera.rays)
 
     def depths_seen(self, points: np.ndarray, near_plane: float = NEAR_PLANE) -> np.ndarray:
         """Return the depths [S] of the points, among [P, 3], that are in the picture and beyond the near plane."""
-        own = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
-        own = own[own[:, 2] > near_plane]
-        places = pinhole_pixels(own, self.K)
-        return np.asarray(own[((places >= self.low) & (places <= self.high)).all(axis=1), 2])
+        in_frame = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
+        in_front = in_frame[in_frame[:, 2] > near_plane]
+        places = pinhole_pixels(in_front, self.K)
+        is_seen = ((places >= self.low) & (places <= self.high)).all(axis=1)
+        return np.asarray(in_front[is_seen, 2])
 
     def num_seen(self, points: np.ndarray, near_plane: float = NEAR_PLANE) -> int:
         """Return the number of points [P, 3] in the picture and beyond the near plane."""
@@ -263,34 +296,39 @@ def random_points(sights: Sequence[Sight], object_axes: np.ndarray | None = None
       sights: what each training view shows. The origin is the point nearest to their optical axes.
       object_axes: [3, 3] axes of the object's cube, as columns; None for other scenes.
     """
-    rng, cube = np.random.default_rng(0), np.zeros((0, 3))
+    rng = np.random.default_rng(0)
     viewmats = np.stack([sight.viewmat for sight in sights])
-    centers, axes = camera_centers(viewmats), viewmats[:, 2, :3]
+    K = np.stack([sight.K for sight in sights])
+    low = np.stack([sight.low for sight in sights])
+    high = np.stack([sight.high for sight in sights])
+    centers = camera_centers(viewmats)
+    axes = viewmats[:, 2, :3]
     distances = np.linalg.norm(centers, axis=1)
-    # Width and height that a view shows at distance 1.
-    slopes = np.stack([(sight.high - sight.low) / np.diag(sight.K)[:2] for sight in sights])
+    cube = np.zeros((0, 3))
     if object_axes is not None:
+        # Width and height that a view shows at distance 1.
+        slopes = (high - low) / np.diagonal(K, axis1=1, axis2=2)[:, :2]
         half_side = OBJECT_SHARE * np.median(distances * slopes.min(axis=1) / 2)
         filled = rng.uniform(-half_side, half_side, (NUM_CANDIDATES // 2, 3)) @ object_axes.T
-        cube = cube if unseeing(filled, sights) else filled
+        if not unseeing(filled, sights):
+            cube = filled
     # Each other point is on a random ray of one view, at a random depth, and the views take turns.
     num = NUM_CANDIDATES - len(cube)
     view = np.arange(num) % len(sights)
-    low, high = (np.stack([getattr(sight, side) for sight in sights])[view] for side in ("low", "high"))
-    places = np.concatenate([rng.uniform(low, high), np.ones((num, 1))], axis=1)
-    to_rays = np.linalg.inv(np.stack([sight.K for sight in sights]))[view]
+    places = np.concatenate([rng.uniform(low[view], high[view]), np.ones((num, 1))], axis=1)
     share = rng.uniform(size=num)
     # Cosine between the optical axis and the direction to the origin: near 1 if the cameras surround a subject.
     facing = -np.einsum("vi,vi->v", centers, axes) / np.maximum(distances, 1e-12)
     if np.median(facing) >= LEAST_FACING:
         # A camera at the origin would have all of its points at its own centre.
-        depths = (NEAREST + (DEEPEST_AROUND - NEAREST) * share) * np.maximum(distances, SHALLOWEST)[view]
+        reach = np.maximum(distances, SHALLOWEST)
+        depths = (NEAREST + (DEEPEST_AROUND - NEAREST) * share) * reach[view]
     else:
         # Even in log depth: as many points for each doubling of the distance.
         depths = SHALLOWEST * (DEEPEST / SHALLOWEST) ** share
-    own = np.einsum("pij,pj->pi", to_rays, places) * depths[:, None]
-    # Back to the world, x = Rᵀ·own + centre; "pji" transposes R.
-    offsets = np.einsum("pji,pj->pi", viewmats[view, :3, :3], own)
+    in_frame = np.einsum("pij,pj->pi", np.linalg.inv(K)[view], places) * depths[:, None]
+    # Back to the world, x = Rᵀ·in_frame + centre; "pji" transposes R.
+    offsets = np.einsum("pji,pj->pi", viewmats[view, :3, :3], in_frame)
     return np.concatenate([cube, offsets + centers[view]])
 
 
@@ -309,8 +347,8 @@ def rigid_motion(motion: np.ndarray, what: str) -> np.ndarray:
     rotation = motion[:3, :3]
     if not (np.abs(motion) <= LARGEST_COORDINATE).all():  # False for NaN.
         largest = np.abs(motion).max()
-        found = f"exceeds ±{LARGEST_COORDINATE:g}, at {largest:g}" if np.isfinite(largest) else "is not finite"
-        raise ValueError(f"{what}: its pose {found}; remove it from the scene or correct the pose")
+        fault = f"exceeds ±{LARGEST_COORDINATE:g}, at {largest:g}" if np.isfinite(largest) else "is not finite"
+        raise ValueError(f"{what}: its pose {fault}; remove it from the scene or correct the pose")
     # The nearest orthogonal matrix to R = U·S·Vᵀ is U·Vᵀ; it is a reflection if its determinant is -1.
     left, singular_values, right = np.linalg.svd(rotation)
     if np.abs(singular_values - 1).max() > MAX_SKEW or np.linalg.det(rotation) < 0:
@@ -383,11 +421,12 @@ def _view(shot: Shot, viewmat: np.ndarray) -> View:
     rays: Any = shot.rays  # Views of one lens share the array.
     camera = Camera(jnp.asarray(viewmat, jnp.float32), jnp.asarray(shot.K, jnp.float32), width, height, rays)
     mask = shot.mask
-    if shot.rays is not None and not np.isfinite(shot.rays).all():
-        has_ray = np.isfinite(shot.rays).all(axis=2)
+    if rays is not None:
+        has_ray = np.isfinite(rays).all(axis=2)
         mask = Mask.of(has_ray if mask is None else has_ray & mask.read())
     # Batches of views without masks carry one bool per view (scene.counted_pixels).
-    mask = None if mask is None or mask.is_full else mask
+    if mask is not None and mask.is_full:
+        mask = None
     return View(shot.name, camera, shot.picture, mask, shot.depth, shot.panorama)
 
 

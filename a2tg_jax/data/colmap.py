@@ -19,7 +19,7 @@ from a2tg_jax.data.lenses import checked_lens
 from a2tg_jax.data.photo_reading import Options, Photo, read_photos
 from a2tg_jax.data.ply import read_ply_points
 from a2tg_jax.data.scene import Scene, scene_name
-from a2tg_jax.host.regular_files import is_folder, is_regular, names_in
+from a2tg_jax.host.regular_files import is_regular, names_in
 from a2tg_jax.host.text import counted
 
 SUFFIXES = (".bin", ".txt")
@@ -102,13 +102,13 @@ def load_colmap(path: Path, options: Options) -> Scene:
     lenses = {key: checked_lens(contents.cameras[key], f"{model}: camera {key}", options.lens) for key in used}
     # Folders in the scene folder itself may hold other pictures.
     warn_of_unposed(folder, [image.name for image in images], is_deep=folder != scene)
-    viewmats, panoramas = contents.viewmats, _panoramas(contents)
+    panoramas = _panoramas(contents)
     photos = [
         Photo(
             image.name, viewmat, (folder, image.name), (scene / IMAGES, image.name), lenses[image.camera_id],
             str(folder / image.name), panorama=panoramas.get(image.id),
         )
-        for image, viewmat in zip(images, viewmats, strict=True)
+        for image, viewmat in zip(images, contents.viewmats, strict=True)
     ]  # fmt: skip
 
     def how_to_remove(name: str) -> str:
@@ -148,12 +148,13 @@ def points_in_world_of(path: Path, viewmats: Mapping[str, np.ndarray]) -> PointC
         return None
     model = _model_of(path)
     contents = _read_model(model)
-    own = {_plain_name(image.name): viewmat for image, viewmat in zip(contents.images, contents.viewmats, strict=True)}
+    names = [_plain_name(image.name) for image in contents.images]
+    poses = dict(zip(names, contents.viewmats, strict=True))
     others = {_plain_name(name): viewmat for name, viewmat in viewmats.items()}
-    shared = sorted(own.keys() & others.keys())
+    shared = sorted(poses.keys() & others.keys())
     to_world = None
     if shared:
-        to_world = _between(np.stack([own[name] for name in shared]), np.stack([others[name] for name in shared]))
+        to_world = _between(np.stack([poses[name] for name in shared]), np.stack([others[name] for name in shared]))
     if to_world is None:
         message = f"{model}: has other photographs or poses than the scene: its points are not used"
         warnings.warn(message, stacklevel=3)
@@ -189,13 +190,14 @@ def _between(viewmats: np.ndarray, others: np.ndarray) -> Similarity | None:
 def viewmat_of(image: ImageRecord) -> np.ndarray:
     """Return the world-to-camera matrix [4, 4] of an image. Its quaternion may have any length but 0."""
     viewmat = np.eye(4)
-    quaternion, viewmat[:3, 3] = np.array(image.pose[:4]), image.pose[4:]
+    viewmat[:3, 3] = image.pose[4:]
+    quaternion = np.array(image.pose[:4])
     length = np.linalg.norm(quaternion)
     if length == 0:
         raise ValueError(f"{image.name}: its pose has a quaternion of zeros; remove it from the model")
-    # rigid_viewmat reports NaN.
-    is_finite = np.isfinite(length)
-    viewmat[:3, :3] = Rotation.from_quat(quaternion, scalar_first=True).as_matrix() if is_finite else np.nan
+    viewmat[:3, :3] = np.nan  # rigid_viewmat reports it.
+    if np.isfinite(length):
+        viewmat[:3, :3] = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
     return rigid_viewmat(viewmat, image.name)
 
 
@@ -223,8 +225,11 @@ def _model_files(folder: Path) -> dict[str, Path]:
     """Return the files of the model in a folder by kind, whatever their capitals; none if it has no model."""
     names = {name.lower(): name for name in names_in(folder)}
     for suffix in SUFFIXES:
-        own = {kind: folder / names[each] for kind in KINDS if (each := f"{kind}{suffix}".lower()) in names}
-        files = {kind: file for kind, file in own.items() if is_regular(file)}
+        files = {}
+        for kind in KINDS:
+            name = names.get(f"{kind}{suffix}".lower())
+            if name is not None and is_regular(folder / name):
+                files[kind] = folder / name
         if "cameras" in files and "images" in files:
             return files
     return {}
@@ -233,25 +238,27 @@ def _model_files(folder: Path) -> dict[str, Path]:
 def _read_model(model: Path) -> SparseModel:
     """Return the model in a folder; without a points3D file, it has no points."""
     files = _model_files(model)
-    found = {kind: read_file(file, kind) for kind, file in files.items()}
+    records = {kind: read_file(file, kind) for kind, file in files.items()}
+    cameras = dict(records["cameras"])
+    images = records["images"]
     text = on_disk(model, "images.txt") if files["images"].suffix.lower() == ".bin" else None
-    if text is not None and (num := num_images(text)) != len(found["images"]):
+    num_in_text = len(images) if text is None else num_images(text)
+    if num_in_text != len(images):
         warnings.warn(
-            f"{model}: is read from its .bin files, with {counted(len(found['images']), 'image')}, and not from its "
-            f".txt files, with {num}; to read those, move the .bin files away",
+            f"{model}: is read from its .bin files, with {counted(len(images), 'image')}, and not from its "
+            f".txt files, with {num_in_text}; to read those, move the .bin files away",
             stacklevel=3,
         )
-    cameras = dict(found["cameras"])
-    for image in found["images"]:
+    for image in images:
         if image.camera_id not in cameras:
             raise ValueError(
                 f"{files['images']}: {image.name} has the camera {image.camera_id}, which is not in "
                 f"{files['cameras'].name}; export the model again"
             )
-    points = found.get("points3D", np.empty(0, POINT))
+    points = records.get("points3D", np.empty(0, POINT))
     # Files have points in any order; by id, a model starts alike from its binary and its text files.
     points = points[np.argsort(points["id"], kind="stable")]
-    return SparseModel(cameras, found["images"], points, found.get("rigs", []), found.get("frames", []))
+    return SparseModel(cameras, images, points, records.get("rigs", []), records.get("frames", []))
 
 
 def _find_photos(path: Path, model: Path, images: Sequence[ImageRecord], downscale: int) -> tuple[Path, Path]:
@@ -269,11 +276,11 @@ def _find_photos(path: Path, model: Path, images: Sequence[ImageRecord], downsca
 
     for base in bases:
         names = sorted((name for name in names_in(base) if name.lower() == IMAGES), reverse=True)  # "images" first
-        folder = next((base / name for name in names if is_folder(base / name)), None)
+        folder = next((base / name for name in names if (base / name).is_dir()), None)
         if folder is not None:
             # A folder `images` may be another program's, or be part of the names.
             return base, base if holds_some(base) and not holds_some(folder) else folder
-        if downscale > 1 and is_folder(base / f"{IMAGES}_{downscale}"):
+        if downscale > 1 and (base / f"{IMAGES}_{downscale}").is_dir():
             return base, base / IMAGES
     for base in bases:
         if holds_some(base):

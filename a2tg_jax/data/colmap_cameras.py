@@ -83,8 +83,9 @@ class ColmapCamera:
         """
         if not self.model.num_focal:
             raise ValueError(f"{self.name} has no image plane{CUT}")
-        focal, (cx, cy) = self.params[: self.model.num_focal], self.params[self.model.num_focal :][:2]
-        return np.array([[focal[0], 0.0, cx], [0.0, focal[-1], cy], [0.0, 0.0, 1.0]])
+        num_focal = self.model.num_focal
+        cx, cy = self.params[num_focal : num_focal + 2]
+        return np.array([[self.params[0], 0.0, cx], [0.0, self.params[num_focal - 1], cy], [0.0, 0.0, 1.0]])
 
     @cached_property
     def colmap(self) -> Any:

@@ -21,13 +21,13 @@ import os
 import re
 import struct
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
-from a2tg_jax.data.colmap_cameras import BY_NAME, MODELS, ColmapCamera
+from a2tg_jax.data.colmap_cameras import BY_NAME, MODELS, CameraModel, ColmapCamera
 from a2tg_jax.host.regular_files import open_regular
 from a2tg_jax.host.text import shortened
 
@@ -95,9 +95,9 @@ def read_file(path: Path, kind: str) -> Any:
         if path.suffix.lower() != ".bin":
             return _read_text(opened, path, kind)
         if os.fstat(opened.fileno()).st_size == 0:  # mmap rejects empty files.
-            return _Binary(path, b"").read(kind)
+            return _read_binary(path, b"", kind)
         with mmap.mmap(opened.fileno(), 0, access=mmap.ACCESS_READ) as data:
-            return _Binary(path, data).read(kind)
+            return _read_binary(path, data, kind)
 
 
 def _decoded_name(path: Path, name: bytes) -> str:
@@ -110,157 +110,216 @@ def _decoded_name(path: Path, name: bytes) -> str:
         ) from None
 
 
-_little_endian = functools.cache(lambda format: struct.Struct(f"<{format}"))
+@functools.cache
+def _little_endian(format: str) -> struct.Struct:
+    return struct.Struct(f"<{format}")
 
 
-class _Binary:
-    """Reader of a binary file that never passes its end. Methods named after kinds return one record."""
+class _Bytes:
+    """What is in a binary file, in order. Reading never passes its end."""
 
     def __init__(self, path: Path, data: mmap.mmap | bytes):
-        self.path, self.data, self.at, self.place = path, data, 0, "the count"
-
-    def read(self, kind: str) -> Any:
-        """Return all records; of points3D an array [P] of `POINT`."""
-        (num,) = self.take("Q")
-        record, found = getattr(self, kind), list[Any]()
-        for number in range(1, num + 1):
-            self.place = f"number {number} of {num} {kind}"
-            found.append(record())
-        if left := len(self.data) - self.at:
-            raise self.error(f"is followed by {left} bytes")
-        return np.frombuffer(b"".join(found), POINT) if kind == "points3D" else found
+        self.path = path
+        self.data = data
+        self.at = 0
+        self.place = "the count"
+        """Part of the file that is being read, for messages."""
 
     def error(self, what: str) -> ValueError:
         return ValueError(f"{self.path}: is cut off or damaged: {self.place} {what}; export the model again")
 
     def skip(self, num_bytes: int) -> int:
         """Return the position from before."""
-        left = len(self.data) - self.at
+        start = self.at
+        left = len(self.data) - start
         if num_bytes > left:
-            raise self.error(f"needs {num_bytes} bytes at byte {self.at}, and {left} are left")
+            raise self.error(f"needs {num_bytes} bytes at byte {start}, and {left} are left")
         self.at += num_bytes
-        return self.at - num_bytes
+        return start
 
     def take(self, format: str) -> tuple[Any, ...]:
         numbers = _little_endian(format)
         return numbers.unpack_from(self.data, self.skip(numbers.size))
 
-    def cameras(self) -> tuple[int, ColmapCamera]:
-        number, model = self.take("Ii")
-        if model not in MODELS:
-            raise self.error(f"has the camera model {model}, which is none of COLMAP's")
-        width, height, *params = self.take(f"2Q{MODELS[model].num_params}d")
-        return number, ColmapCamera(MODELS[model].name, width, height, tuple(params))
+    def whole(self, format: str = "I") -> int:
+        (number,) = self.take(format)
+        return int(number)
 
-    def images(self) -> ImageRecord:
-        number, *pose, camera = self.take("I7dI")
+    def floats(self, count: int) -> list[float]:
+        return list(self.take(f"{count}d"))
+
+    def model(self) -> CameraModel:
+        number = self.whole("i")
+        if number not in MODELS:
+            raise self.error(f"has the camera model {number}, which is none of COLMAP's")
+        return MODELS[number]
+
+    def params(self, model: CameraModel) -> list[float]:
+        return self.floats(model.num_params)
+
+    def name(self) -> str:
         end = self.data.find(b"\0", self.at, self.at + LONGEST_NAME)
         if end < 0:
             raise self.error("has a name that does not end")
-        name = _decoded_name(self.path, self.data[self.skip(end + 1 - self.at) : end])
-        self.skip(24 * self.take("Q")[0])  # The features, which are not needed.
-        return ImageRecord(number, pose, camera, name)
+        return _decoded_name(self.path, self.data[self.skip(end + 1 - self.at) : end])
 
-    def points3D(self) -> bytes:
+    def skip_features(self) -> None:
+        self.skip(24 * self.whole("Q"))
+
+    def point(self) -> bytes:
         start = self.skip(POINT.itemsize)
         point = self.data[start : self.at]
-        self.skip(8 * self.take("Q")[0])  # The track, which is not needed.
+        self.skip(8 * self.whole("Q"))  # The track, which is not needed.
         return point
 
-    def rigs(self) -> RigRecord:
-        number, count = self.take("II")
-        translations: list[list[float] | None] = []
-        for index in range(count):
-            self.take("iI")
-            if index:  # The first sensor, the reference, has no pose.
-                translations.append(list(self.take("7d")[4:]) if self.take("B")[0] else None)
-        return RigRecord(number, translations)
-
-    def frames(self) -> FrameRecord:
-        number, rig, *_, count = self.take("II7dI")
-        data = [self.take("iIQ") for _ in range(count)]
-        return FrameRecord(number, rig, [image for kind, _, image in data if kind == CAMERA_SENSOR])
+    def is_camera(self) -> bool:
+        return self.whole("i") == CAMERA_SENSOR
 
 
-def _whole(word: bytes) -> int:
-    """Return a whole number of at least 0, which may be written like 96.0."""
-    number = int(word) if word.isdigit() else float(word)  # A float would round ids above 2^53.
-    if not 0 <= number < 1 << 64 or number != int(number):  # NaN fails as well.
-        raise ValueError(f"{shortened(word.decode(errors='replace'))} is not a whole number of at least 0")
-    return int(number)
+class _Words:
+    """What is in a line of a text file, in order; of images also the line of features after it."""
 
+    def __init__(self, path: Path, line: bytes, features: bytes):
+        self.path = path
+        self.line = line
+        self.features = features
+        self.words = iter(line.split())
 
-def _text_record(kind: str, path: Path, line: bytes, features: bytes) -> Any:
-    """Return the record in a line, and of images in the line of features after it."""
-    words = iter(line.split())
+    def whole(self, format: str = "") -> int:
+        """Return a whole number of at least 0, which may be written like 96.0."""
+        word = next(self.words)
+        number = int(word) if word.isdigit() else float(word)  # A float would round ids above 2^53.
+        if not 0 <= number < 1 << 64 or number != int(number):  # NaN fails as well.
+            raise ValueError(f"{shortened(word.decode(errors='replace'))} is not a whole number of at least 0")
+        return int(number)
 
-    def whole() -> int:
-        return _whole(next(words))
+    def floats(self, count: int) -> list[float]:
+        return [float(next(self.words)) for _ in range(count)]
 
-    def floats(count: int) -> list[float]:
-        return [float(next(words)) for _ in range(count)]
-
-    record: Any
-    if kind == "cameras":
-        number, name = whole(), next(words).decode("ascii", "replace")
+    def model(self) -> CameraModel:
+        name = next(self.words).decode("ascii", "replace")
         if name not in BY_NAME:
             raise ValueError(f"COLMAP has no camera model {shortened(name)}")
-        width, height, params = whole(), whole(), tuple(float(word) for word in words)
-        if len(params) != BY_NAME[name].num_params:
-            raise ValueError(f"{name} has {BY_NAME[name].num_params} parameters; got {len(params)}")
-        record = number, ColmapCamera(name, width, height, params)
-    elif kind == "images":
-        number, pose, camera, _ = whole(), floats(7), whole(), next(words)
-        name = _decoded_name(path, line.split(None, 9)[9].strip())  # The rest of the line, which may have spaces.
-        words = iter(())  # The name took the rest of the line.
+        return BY_NAME[name]
+
+    def params(self, model: CameraModel) -> list[float]:
+        params = [float(word) for word in self.words]
+        if len(params) != model.num_params:
+            raise ValueError(f"{model.name} has {model.num_params} parameters; got {len(params)}")
+        return params
+
+    def name(self) -> str:
+        next(self.words)
+        self.words = iter(())  # The name is the rest of the line, which may have spaces.
+        return _decoded_name(self.path, self.line.split(None, 9)[9].strip())
+
+    def skip_features(self) -> None:
         # Each feature has x, y and the id of its point, or -1. If the line is missing, this is the next image's, which
         # ends with a name.
-        triples = features.split()
-        if len(triples) % 3 or not all(re.fullmatch(rb"-1|\d+(\.0*)?", word) for word in triples[2:3] + triples[-1:]):
+        triples = self.features.split()
+        ids = triples[2:3] + triples[-1:]
+        if len(triples) % 3 or not all(re.fullmatch(rb"-1|\d+(\.0*)?", word) for word in ids):
             raise ValueError("the line of its points is missing or cut off")
-        record = ImageRecord(number, pose, camera, name)
-    elif kind == "points3D":
-        number, position, color, error = whole(), floats(3), floats(3), floats(1)[0]
-        if len(list(words)) % 2:
+
+    def point(self) -> tuple[int, list[float], list[int], float]:
+        number = self.whole()
+        position = self.floats(3)
+        color = [min(max(round(value), 0), 255) for value in self.floats(3)]
+        (error,) = self.floats(1)
+        if len(list(self.words)) % 2:
             raise ValueError("the track of a point must be pairs")
-        record = number, position, [min(max(round(value), 0), 255) for value in color], error
-    elif kind == "rigs":
-        translations: list[list[float] | None] = []
-        number = whole()
-        for index in range(whole()):
-            _, _ = next(words), whole()
-            if index:
-                translations.append(floats(7)[4:] if whole() else None)
-        record = RigRecord(number, translations)
-    else:
-        number, rig, _, count = whole(), whole(), floats(7), whole()
-        data = [(next(words), whole(), whole()) for _ in range(count)]
-        record = FrameRecord(number, rig, [image for sensor, _, image in data if sensor == b"CAMERA"])
-    if next(words, None) is not None:
-        raise ValueError("it continues past its end")
-    return record
+        return number, position, color, error
+
+    def is_camera(self) -> bool:
+        return next(self.words) == b"CAMERA"
+
+
+def _camera(source: _Bytes | _Words) -> tuple[int, ColmapCamera]:
+    number = source.whole()
+    model = source.model()
+    width = source.whole("Q")
+    height = source.whole("Q")
+    return number, ColmapCamera(model.name, width, height, tuple(source.params(model)))
+
+
+def _image(source: _Bytes | _Words) -> ImageRecord:
+    image = ImageRecord(source.whole(), source.floats(7), source.whole(), source.name())
+    source.skip_features()
+    return image
+
+
+def _point(source: _Bytes | _Words) -> Any:
+    return source.point()
+
+
+def _rig(source: _Bytes | _Words) -> RigRecord:
+    number = source.whole()
+    translations: list[list[float] | None] = []
+    for index in range(source.whole()):
+        source.is_camera()
+        source.whole()
+        if index:  # The first sensor, the reference, has no pose.
+            translations.append(source.floats(7)[4:] if source.whole("B") else None)
+    return RigRecord(number, translations)
+
+
+def _frame(source: _Bytes | _Words) -> FrameRecord:
+    number = source.whole()
+    rig = source.whole()
+    source.floats(7)
+    images = []
+    for _ in range(source.whole()):
+        is_camera = source.is_camera()
+        source.whole()
+        image = source.whole("Q")
+        if is_camera:
+            images.append(image)
+    return FrameRecord(number, rig, images)
+
+
+RECORDS: dict[str, Callable[[_Bytes | _Words], Any]] = {
+    "cameras": _camera, "images": _image, "points3D": _point, "rigs": _rig, "frames": _frame,
+}  # fmt: skip
+
+
+def _read_binary(path: Path, data: mmap.mmap | bytes, kind: str) -> Any:
+    source = _Bytes(path, data)
+    num = source.whole("Q")
+    records = []
+    for number in range(1, num + 1):
+        source.place = f"number {number} of {num} {kind}"
+        records.append(RECORDS[kind](source))
+    left = len(data) - source.at
+    if left:
+        raise source.error(f"is followed by {left} bytes")
+    return np.frombuffer(b"".join(records), POINT) if kind == "points3D" else records
 
 
 def _read_text(file: BinaryIO, path: Path, kind: str) -> Any:
     announced: int | None = None
-    found = []
+    records = []
     lines = _lines(file, path)
     for number, line in lines:
-        if match := ANNOUNCED.match(line):
-            announced = int(match[1])
+        comment = ANNOUNCED.match(line)
+        if comment is not None:
+            announced = int(comment[1])
         if not _has_record(line):
             continue
         try:
-            found.append(_text_record(kind, path, line, next(lines, (0, b""))[1] if kind == "images" else b""))
+            _, features = next(lines, (0, b"")) if kind == "images" else (0, b"")
+            source = _Words(path, line, features)
+            records.append(RECORDS[kind](source))
+            if next(source.words, None) is not None:
+                raise ValueError("it continues past its end")
         except (ValueError, OverflowError, StopIteration) as error:
             if str(error).startswith(str(path)):  # It names the file already.
                 raise
             reason = "it is cut off" if isinstance(error, StopIteration) else shortened(str(error))
             raise ValueError(f"{path}: line {number} cannot be read ({reason}); export the model again") from None
-    if announced not in (None, len(found)):
-        message = f"{path}: says that it has {announced} {kind}, and has {len(found)}: if it is cut off, export it"
+    if announced not in (None, len(records)):
+        message = f"{path}: says that it has {announced} {kind}, and has {len(records)}: if it is cut off, export it"
         warnings.warn(f"{message} again", stacklevel=3)
-    return np.array(found, POINT) if kind == "points3D" else found
+    return np.array(records, POINT) if kind == "points3D" else records
 
 
 def _has_record(line: bytes) -> bool:
@@ -269,9 +328,8 @@ def _has_record(line: bytes) -> bool:
 
 def _lines(file: BinaryIO, path: Path) -> Iterator[tuple[int, bytes]]:
     """Yield the lines of a file with their numbers from 1, each of bounded length."""
-    number = 0
-    while line := file.readline(LONGEST_LINE + 1):  # One byte more shows that a line is too long.
-        number += 1
+    # One byte more shows that a line is too long.
+    for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE + 1), b""), 1):
         if len(line) > LONGEST_LINE:
             raise ValueError(f"{path}: has a line of more than {LONGEST_LINE:,} bytes; export the model again")
         yield number, line.removeprefix(BYTE_ORDER_MARK) if number == 1 else line

@@ -18,7 +18,6 @@ import numpy as np
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from a2tg_jax.host.regular_files import open_regular
-from a2tg_jax.host.remote_files import is_remote
 from a2tg_jax.host.text import shortened
 
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "AVIF", "BMP", "GIF", "PPM")
@@ -29,7 +28,8 @@ BITS_PER_SAMPLE = 258
 """TIFF tag of the bits per sample."""
 TIFF_SIZE = 256, 257
 """TIFF tags of the stored width and height."""
-TURNED, SIDEWAYS = range(2, 9), range(5, 9)
+TURNED = range(2, 9)
+SIDEWAYS = range(5, 9)
 """EXIF orientations other than upright, and the ones that exchange width and height."""
 AS_STORED = {
     2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180, 4: Image.Transpose.FLIP_TOP_BOTTOM,
@@ -139,7 +139,8 @@ def save_upright(path: str | os.PathLike[str], target: Path, quality: int) -> No
     TIFF's layout would be wrong.
     """
     with _opened(path) as image:
-        stored, exif = image.getexif(), Image.Exif()
+        stored = image.getexif()
+        exif = Image.Exif()
         exif.update({tag: stored[tag] for tag in LENS_TAGS[:2] if tag in stored})
         details = stored.get_ifd(ExifTags.IFD.Exif)
         exif.get_ifd(ExifTags.IFD.Exif).update(
@@ -199,12 +200,12 @@ def _opened(path: str | os.PathLike[str], most_bits: int = 8, is_decoded: bool =
                 raise ValueError(f"{path}: has more than 8 bits per channel; convert it to an 8-bit image")
             yield image
     except Exception as error:  # Damaged pictures raise anything from SyntaxError to struct.error.
-        if str(error).startswith(f"{path}: "):  # Raised above, or by a store that does not answer.
+        if str(error).startswith(f"{path}: "):  # Raised above.
             raise
         reason = shortened(str(error) or type(error).__name__, LONGEST_REASON)
         if isinstance(error, UnidentifiedImageError):  # Its text names an object of Python instead of the file.
-            is_empty = not is_remote(path) and not os.path.getsize(path)
-            reason = "it is empty: 0 bytes" if is_empty else f"it is none of {', '.join(FORMATS)}"
+            known = f"it is none of {', '.join(FORMATS)}"
+            reason = known if os.path.getsize(path) else "it is empty: 0 bytes"
         raise ValueError(f"{path}: cannot be read as an image ({reason}); replace or remove it") from error
 
 

@@ -158,7 +158,7 @@ def _receive(url: str, partial: Path, version: Path, progress: bool) -> int | No
             name = partial.name.removesuffix(".partial")
             bar = new_bar(desc=name, initial=start, total=total, unit="B", unit_scale=True, disable=not progress)
             with open(partial, "ab" if start else "wb") as opened, bar:
-                while chunk := response.read(CHUNK_BYTES):
+                for chunk in iter(lambda: response.read(CHUNK_BYTES), b""):
                     opened.write(chunk)
                     bar.update(len(chunk))
             return total

@@ -9,7 +9,6 @@ from pathlib import Path, PurePath, PureWindowsPath
 from typing import TypeVar
 
 from a2tg_jax.host.regular_files import is_regular, names_in
-from a2tg_jax.host.remote_files import is_remote
 from a2tg_jax.host.text import counted, shortened
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".avif")
@@ -48,7 +47,7 @@ def inside(folder: Path, name: str) -> str:
     # On Linux and macOS a backslash may also be a letter of a name.
     is_file = "\0" not in name and "\\" in name and is_regular(folder / name)
     path = Path(name if is_file else name.replace("\\", "/"))
-    if path.is_absolute() and not is_remote(folder):
+    if path.is_absolute():
         roots = os.path.abspath(folder), os.path.realpath(folder)  # The scene may have been written through a link.
         path = next((path.relative_to(root) for root in roots if path.is_relative_to(root)), path)
     # On Windows /x has a root and C:x a drive, but neither is absolute.
@@ -81,11 +80,11 @@ def _letters(name: str) -> str:
 
 
 def warn_of_unposed(folder: Path, names: Iterable[str], is_deep: bool = True) -> None:
-    """Warn of photographs in a local folder (`is_deep`: and its subfolders) that are not among some names.
+    """Warn of photographs in a folder (`is_deep`: and its subfolders) that are not among some names.
 
     The names are paths below it, whose suffixes and capitals may differ.
     """
-    if is_remote(folder) or not folder.is_dir():
+    if not folder.is_dir():
         return
     own = {_letters(PurePath(name).with_suffix("").as_posix()) for name in names}
     files = (file.relative_to(folder) for file in (folder.rglob("*") if is_deep else folder.iterdir()))
@@ -96,14 +95,7 @@ def warn_of_unposed(folder: Path, names: Iterable[str], is_deep: bool = True) ->
         warnings.warn(f"{folder}: {left_out}: not used", stacklevel=3)
 
 
-def map_in_threads(
-    function: Callable[..., Result], *iterables: Iterable[object], place: Path | None = None
-) -> list[Result]:
-    """Return list(map(function, *iterables)), run in several threads.
-
-    Decoding and resizing of pictures release Python's lock. Threads that wait for a store, if the place is in one, take
-    no core.
-    """
-    is_waiting = place is not None and is_remote(place)
-    with ThreadPoolExecutor(max_workers=MOST_READERS if is_waiting else min(MOST_READERS, os.cpu_count() or 1)) as pool:
+def map_in_threads(function: Callable[..., Result], *iterables: Iterable[object]) -> list[Result]:
+    """Return list(map(function, *iterables)), run in threads, as decoding of pictures releases Python's lock."""
+    with ThreadPoolExecutor(max_workers=min(MOST_READERS, os.cpu_count() or 1)) as pool:
         return list(pool.map(function, *iterables))

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import threading
+from collections.abc import Callable
 from functools import cached_property
 from typing import Literal
 
@@ -18,7 +19,8 @@ PINHOLE_TOLERANCE = 1e-3
 """Largest deviation in pixels of a camera that still counts as a pinhole."""
 LARGEST_DISTORTION = 1e6
 """Largest absolute distortion parameter. Telephoto lenses, with small angles, have large ones."""
-GRID, MARGIN = 9, 0.1
+GRID = 9
+MARGIN = 0.1
 """Number of test points along an axis of an undistorted image, and their largest distance outside the photograph."""
 ROWS_AT_ONCE = 128  # Rays of a whole photograph would take many times its memory.
 WIDEST_ANGLE = np.deg2rad(80.0)
@@ -68,7 +70,8 @@ class Lens:
             pinhole = colmap.undistort_camera(colmap.UndistortCameraOptions(), self.camera.colmap)
         except (ValueError, RuntimeError):  # COLMAP's own check that the model is perspective
             raise ValueError(f"{self.camera.name} cannot be undistorted to a pinhole camera{CUT}") from None
-        K, size = pinhole.calibration_matrix(), (pinhole.width, pinhole.height)
+        K = pinhole.calibration_matrix()
+        size = (pinhole.width, pinhole.height)
         # The middle half of the image must be nearly in the photograph and not mirrored. Corners may fold, because
         # calibrations are arbitrary where they saw no feature.
         x, y = (side * np.linspace(0.25, 0.75, GRID) for side in size)
@@ -94,7 +97,7 @@ class Lens:
             planes = pixels.astype(np.float32)
             if planes.shape[2] == 4:  # Colours are multiplied by alpha, so that transparent neighbours do not bleed.
                 planes[..., :3] *= planes[..., 3:] / 255
-            planes = self._sampled(planes)
+            planes = self._undistorted(planes)
             if planes.shape[2] == 4:
                 planes[..., :3] *= 255 / np.maximum(planes[..., 3:], 1)  # Colours are 0 where alpha is.
             pixels = np.clip(np.rint(planes), 0, 255).astype(np.uint8)
@@ -111,12 +114,13 @@ class Lens:
         """Return (width, height) of a photograph of a size after it is undistorted, before it is downscaled."""
         if self.is_pinhole:
             return stored
-        scales, size = np.divide(stored, self.size), self.pinhole[1]
-        return round(size[0] * scales[0]), round(size[1] * scales[1])
+        _, size = self.pinhole
+        width, height = np.divide(stored, self.size) * size
+        return round(width), round(height)
 
     def view_plane(self, plane: np.ndarray) -> np.ndarray:
         """Return numbers [h, w] float32 of a photograph's pixels, undistorted like its view, not downscaled."""
-        return plane if self.is_kept or self.is_pinhole else self._sampled(plane[..., None])[..., 0]
+        return plane if self.is_kept or self.is_pinhole else self._undistorted(plane[..., None])[..., 0]
 
     def rays(self, width: int, height: int) -> np.ndarray | None:
         """Return the rays [height, width, 2] of views of a size, as in `Camera.rays`; NaN where there is none.
@@ -129,22 +133,38 @@ class Lens:
         with _LOCK:  # Threads that read photographs of one lens share its rays.
             return _rays(self.camera, (width, height), K.tobytes())
 
-    def _sampled(self, planes: np.ndarray) -> np.ndarray:
+    def _undistorted(self, planes: np.ndarray) -> np.ndarray:
         """Return float32 planes of the undistorted image, sampled bilinearly from planes [h, w, C] of a photograph."""
         stored = planes.shape[1::-1]
-        width, height = self._undistorted_size(stored)
-        to_rays = np.linalg.inv(_scaled_intrinsics(*self.pinhole, (width, height))).T
-        warped = np.empty((height, width, planes.shape[2]), np.float32)
-        for top in range(0, height, ROWS_AT_ONCE):
-            rows = warped[top : top + ROWS_AT_ONCE]
-            x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(top, top + len(rows)) + 0.5)
+        size = self._undistorted_size(stored)
+        to_rays = np.linalg.inv(_scaled_intrinsics(*self.pinhole, size)).T
+
+        def places(x: np.ndarray, y: np.ndarray) -> np.ndarray:
             rays = _homogeneous(np.stack([x, y], -1).reshape(-1, 2)) @ to_rays
             # From x and y of COLMAP, whose first pixel has its centre at 0.5, to row and column of the array.
-            places = self.camera.pixels(rays) * np.divide(stored, self.size) - 0.5
-            coordinates = places[:, ::-1].T.reshape(2, len(rows), width)
-            for channel in range(planes.shape[2]):
-                rows[..., channel] = map_coordinates(planes[..., channel], coordinates, order=1, mode="nearest")
-        return warped
+            found = self.camera.pixels(rays) * np.divide(stored, self.size) - 0.5
+            return found[:, ::-1].T.reshape(2, *x.shape)
+
+        return sampled(planes, size, places)
+
+
+def sampled(
+    planes: np.ndarray, size: tuple[int, int], places: Callable[[np.ndarray, np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """Return float32 planes of a size (width, height), sampled bilinearly from planes [h, w, C].
+
+    `places` is the function from x and y of pixel centres, [rows, width] each, to rows and columns [2, rows, width] of
+    the given planes.
+    """
+    width, height = size
+    found = np.empty((height, width, planes.shape[2]), np.float32)
+    for top in range(0, height, ROWS_AT_ONCE):
+        rows = found[top : top + ROWS_AT_ONCE]
+        x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(top, top + len(rows)) + 0.5)
+        coordinates = places(x, y)
+        for channel in range(planes.shape[2]):
+            rows[..., channel] = map_coordinates(planes[..., channel], coordinates, np.float32, order=1, mode="nearest")
+    return found
 
 
 @functools.lru_cache(maxsize=256)
@@ -163,9 +183,9 @@ def _rays(camera: ColmapCamera, picture: tuple[int, int], K: bytes) -> np.ndarra
             "the direction of view: are its parameters right?"
         )
     rays = _homogeneous(slopes) @ np.frombuffer(K).reshape(3, 3)[:2].T
-    found = np.where(is_ray[:, None], rays, np.nan).astype(np.float32).reshape(picture[1], picture[0], 2)
-    found.setflags(write=False)  # Views share it.
-    return found
+    rays = np.where(is_ray[:, None], rays, np.nan).astype(np.float32).reshape(picture[1], picture[0], 2)
+    rays.setflags(write=False)  # Views share it.
+    return rays
 
 
 def forget_rays() -> None:

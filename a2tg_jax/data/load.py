@@ -5,9 +5,7 @@ import functools
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Literal
-
-from tyro.conf import Positional, arg
+from typing import Literal
 
 from a2tg_jax.core.checks import check_literal
 from a2tg_jax.data.assembly import check_test_every, with_validation_views
@@ -23,29 +21,28 @@ from a2tg_jax.data.synthetic import BUILT_IN
 from a2tg_jax.data.transforms import (
     BLENDER_FILES,
     NERFSTUDIO_FILE,
-    Frames,
+    Cameras,
     load_blender,
     load_folder,
     load_frames,
     load_transforms,
     transforms_in,
 )
-from a2tg_jax.host.regular_files import is_regular
-from a2tg_jax.host.remote_files import RemotePath, check_reachable, is_remote, is_url, located
+from a2tg_jax.host.regular_files import expanded, is_regular
 from a2tg_jax.host.text import as_argument
 
 HeldOut = Literal["test", "validation"]
-OTHER_PROGRAMS: tuple[Callable[[Path], Callable[[], Frames] | None], ...] = (polycam, record3d, metashape, realityscan)
-"""Functions that recognise a folder of another program, in order of preference, and return what reads its frames."""
+OTHER_PROGRAMS: tuple[Callable[[Path], list[Cameras]], ...] = (polycam, record3d, metashape, realityscan)
+"""Functions that find the cameras of other programs in a folder or a file, in order of preference."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SceneSource:
-    """Source of a scene: what `a2tg train` parses, what run.toml keeps, and what `load` needs."""
+    """Where a scene comes from and how it is read: the options of `a2tg train` on it, which run.toml keeps."""
 
-    path: Annotated[Positional[str], arg(metavar="SCENE")] = ""
-    """Scene folder with photographs and cameras, its URL such as s3://bucket/scene, or a built-in scene, "synthetic" or
-    "cells"; not needed with --config or --resume."""
+    path: str = ""
+    """Scene folder with photographs and cameras, or a built-in scene, "synthetic" or "cells"; not needed with --config
+    or --resume."""
     downscale: int = 1
     """Factor k by which images are downscaled."""
     test_every: int = 8
@@ -75,17 +72,17 @@ class SceneSource:
         """Name of the scene in titles."""
         if self.is_built_in:
             return self.path
-        # os.path, because Path would make one slash of the two in a URL.
-        folder = os.path.dirname(self.path) if Path(self.path).suffix in (".json", ".xml") else self.path
-        return scene_name(folder if is_url(folder) else Path(folder))
+        path = Path(self.path)
+        is_file = path.suffix in (".json", ".xml")
+        return scene_name(path.parent if is_file else path)
 
     def load(self, room: int | None = None) -> Scene:
         """Return the scene, which may be a built-in one. Same arguments and errors as `load_scene`."""
-        return _load(self, room, is_built_in=self.is_built_in)
+        return _load(self, None if self.is_built_in else expanded(self.path), room)
 
 
 def load_scene(
-    path: str | os.PathLike[str] | RemotePath,
+    path: str | os.PathLike[str],
     *,
     downscale: int = 1,
     test_every: int = 8,
@@ -104,8 +101,7 @@ def load_scene(
     a pose are ignored. Masks, black at excluded pixels, are in `masks` next to `images`, or at `mask_path`.
 
     Args:
-      path: the scene folder, a transforms.json, or an XML file of Metashape's cameras; or a URL, such as s3://bucket/x,
-        or UPath of universal_pathlib, of a COLMAP, transforms.json or Blender scene.
+      path: the scene folder, a transforms.json, or an XML file of Metashape's cameras.
       downscale: k >= 1; images are read from `images_k` if it holds all of them at 1/k of their size, and downscaled
         from the full ones otherwise.
       test_every: every k-th of the name-sorted views, from the first, is a test view; 0 keeps none. The views of a
@@ -124,7 +120,6 @@ def load_scene(
 
     Raises:
       FileNotFoundError: if the path, or an image or mask named by the scene, does not exist, or the path is no scene.
-      OSError: if a store does not answer.
       ValueError: if an argument, the model, a pose, an image or a mask is unusable, or fewer than two views are left.
 
     Examples:
@@ -132,42 +127,36 @@ def load_scene(
       >>> len(scene.train), len(scene.test)
       (7, 1)
     """
-    source: SceneSource = SceneSource(path, downscale, test_every, alpha, mask_as, lens)  # type: ignore[arg-type]
-    return _load(source, room)
+    source = SceneSource("", downscale, test_every, alpha, mask_as, lens)
+    return _load(source, expanded(path), room)
 
 
 def is_scene(folder: Path) -> bool:
     """Return whether a folder holds a scene in a known format."""
-    return _loader(folder) is not None or _frames(folder) is not None
+    return _loader(folder) is not None or bool(_cameras_of_other_programs(folder))
 
 
-def _load(source: SceneSource, room: int | None, is_built_in: bool = False) -> Scene:
+def _load(source: SceneSource, path: Path | None, room: int | None) -> Scene:
+    """Return the scene at a path, which may have the name of a built-in one; None: the built-in scene of the source."""
     check_literal("alpha", source.alpha, AlphaMeaning)
     check_literal("mask_as", source.mask_as, MaskMeaning)
     check_literal("lens", source.lens, LensUse)
-    if (source.alpha, source.mask_as) == ("mask", "background"):
+    if source.alpha == "mask" and source.mask_as == "background":
         raise ValueError(
             "`alpha` must be transparency where `mask_as` is background, which makes pixels transparent; got mask"
         )
-    if source.downscale < 1 or source.downscale != int(source.downscale):
-        raise ValueError(f"downscale must be a whole number of at least 1; got {source.downscale}")
+    downscale = source.downscale
+    if downscale < 1 or downscale != int(downscale):
+        raise ValueError(f"downscale must be a whole number of at least 1; got {downscale}")
     check_test_every(source.test_every)
     if room is not None and room < 0:
         raise ValueError(f"room must be at least 0 bytes; got {room}")
-    if is_built_in:
-        scene = BUILT_IN[source.path](downscale=source.downscale, test_every=source.test_every)
+    if path is None:
+        scene = BUILT_IN[source.path](downscale=downscale, test_every=source.test_every)
     else:
-        shelf = Shelf(room)
+        options = Options(int(downscale), source.test_every, source.alpha, source.mask_as, source.lens, Shelf(room))
         try:
-            options = Options(
-                int(source.downscale),
-                source.test_every,
-                source.alpha,
-                source.mask_as,
-                source.lens,
-                shelf,
-            )
-            scene = _read(located(source.path), options)
+            scene = _read(path, options)
         finally:
             forget_rays()
         warn_of_lenses(scene)
@@ -176,50 +165,44 @@ def _load(source: SceneSource, room: int | None, is_built_in: bool = False) -> S
 
 def _read(path: Path, options: Options) -> Scene:
     """Read the scene at a path, or raise FileNotFoundError that says what is there instead."""
-    is_here = not is_remote(path)
-    if is_here and not path.exists():
+    if not path.exists():
         built_in = f"; the built-in scene is {path}_scene()" if str(path) in BUILT_IN else ""
         raise FileNotFoundError(f"{path}: no such scene folder{built_in}")
-    is_json = path.suffix.lower() == ".json"
-    if is_here:
-        if is_video(path):
-            command = f"`a2tg sfm {as_argument(path)} SCENE`"
-            raise ValueError(f"{path}: is a video; to make a scene of it, run {command} first")
-        # OpenSfM's reconstruction.json is JSON as well, but no transforms file.
-        is_json = is_json and is_regular(path) and capture_hint(path) is None
-    else:
-        check_reachable(path.parent if path.suffix.lower() in (".json", ".xml") else path)
-    if is_json:
+    if is_video(path):
+        command = f"`a2tg sfm {as_argument(path)} SCENE`"
+        raise ValueError(f"{path}: is a video; to make a scene of it, run {command} first")
+    # OpenSfM's reconstruction.json is JSON as well, but no transforms file.
+    if path.suffix.lower() == ".json" and is_regular(path) and capture_hint(path) is None:
         return load_transforms(path, options)
-    if (load := _loader(path)) is not None:
+    load = _loader(path)
+    if load is not None:
         return load(options)
-    if not is_here:
-        raise FileNotFoundError(
-            f"{path}: has none of the scenes that are read from a URL: sparse/0, transforms.json or "
-            "transforms_train.json; copy others to a folder, or mount the bucket (mountpoint-s3, gcsfuse, rclone mount)"
-        )
-    if (make := _frames(path)) is not None:
-        return load_frames(make(), options)
+    cameras = _cameras_of_other_programs(path)
+    if cameras:
+        return load_frames(cameras, options)
+    raise FileNotFoundError(f"{path}: {_what_to_give_instead(path)}")
+
+
+def _what_to_give_instead(path: Path) -> str:
+    """Return what is at a path that is no scene, and what to give instead or to do first."""
     hint = capture_hint(path)
     if is_regular(path):
-        nothing = (
+        return hint or (
             "is neither a transforms.json nor an XML file of Metashape's cameras (File > Export > Export Cameras); "
             "give one of these, or the scene's folder"
         )
-        raise FileNotFoundError(f"{path}: {hint or nothing}")
+    command = f"a2tg sfm {as_argument(path)} SCENE"
     if hint is not None:
-        again = f"; or find cameras again: a2tg sfm {as_argument(path)} SCENE" if holds_photos(path) else ""
-        raise FileNotFoundError(f"{path}: {hint}{again}")
+        return f"{hint}; or find cameras again: {command}" if holds_photos(path) else hint
     others = transforms_in(path)
     if others:
-        raise FileNotFoundError(f"{path}: has no {NERFSTUDIO_FILE}, but {others[0].name}: give that file itself")
-    # Such as scene/images, or a folder in it.
-    scene = next((parent for parent in path.resolve().parents[:2] if _loader(parent) is not None), None)
-    if scene is not None:
-        raise FileNotFoundError(f"{path}: is a folder in the scene {scene}; give that folder instead")
-    raise FileNotFoundError(
-        f"{path}: has no sparse model (sparse/0) and no transforms.json or transforms_train.json; "
-        f"for plain photographs, run `a2tg sfm {as_argument(path)} SCENE` first"
+        return f"has no {NERFSTUDIO_FILE}, but {others[0].name}: give that file itself"
+    for parent in path.resolve().parents[:2]:  # The path may be scene/images, or a folder in it.
+        if _loader(parent) is not None:
+            return f"is a folder in the scene {parent}; give that folder instead"
+    return (
+        "has no sparse model (sparse/0) and no transforms.json or transforms_train.json; "
+        f"for plain photographs, run `{command}` first"
     )
 
 
@@ -235,6 +218,10 @@ def _loader(path: Path) -> Callable[[Options], Scene] | None:
     return functools.partial(load_colmap, below) if find_models(below) else None
 
 
-def _frames(path: Path) -> Callable[[], Frames] | None:
-    """Return the function that reads the frames of another program in a folder or a file, or None."""
-    return next(filter(None, (recognise(path) for recognise in OTHER_PROGRAMS)), None)
+def _cameras_of_other_programs(path: Path) -> list[Cameras]:
+    """Return the cameras of the first program that has some in a folder or a file, the preferred ones first."""
+    for find in OTHER_PROGRAMS:
+        cameras = find(path)
+        if cameras:
+            return cameras
+    return []

@@ -14,6 +14,12 @@ MODELS = (
 """Programs, with the pattern of the files of their models below the output folder."""
 ARGUMENTS = "cfg_args"
 """File of 3DGS with the options of a training, printed by Python's argparse."""
+CHECKPOINTS = (".pt", ".pth", ".ckpt")
+HOW_TO_EXPORT = (
+    "write a PLY: gsplat does with --save_ply, nerfstudio with `ns-export gaussian-splat`, 3DGS and 2DGS as "
+    "point_cloud.ply"
+)
+"""Advice to users who have a checkpoint, which is not read."""
 SOURCE_PATH = re.compile(r"source_path='([^']+)'")
 MOST_BYTES = 1 << 20
 
@@ -45,7 +51,13 @@ def other_run(folder: Path) -> OtherRun | None:
 def model_hint(folder: Path) -> str:
     """Return the hint at the model of another program in a folder, to append to an error; "" if there is none."""
     found = other_run(folder)
-    return "" if found is None else f": it is an output folder of {found.program}; give its model {found.model}"
+    if found is None:
+        return ""
+    if found.model.suffix in CHECKPOINTS:
+        instead = f"its checkpoint {found.model} is not read; {HOW_TO_EXPORT}"
+    else:
+        instead = f"give its model {found.model}"
+    return f": it is an output folder of {found.program}; {instead}"
 
 
 def _iteration_of(path: Path) -> int:

@@ -17,7 +17,8 @@ WIDTH = 512
 """Width to which wider pictures are averaged down."""
 EDGE = 24
 """Width of the picture over half the width of the strips at both edges that are compared."""
-LEAST_TEXTURE, LEAST_GROWTH = 2.5, 1.5
+LEAST_TEXTURE = 2.5
+LEAST_GROWTH = 1.5
 """Smallest difference in grey levels of columns at half a strip's width in a row with texture, and its smallest ratio
 to the difference of neighbouring columns, which noise has as well."""
 LEAST_ROWS = 0.04
@@ -27,7 +28,8 @@ MOST_STEP = 0.36
 neighbouring columns: up to 0.22 in panoramas, from 0.45 on in other pictures."""
 UNRELATED = 0.4
 """Step over the seam, in units of the difference at half a strip's width, from which on the edges do not join."""
-MIRRORED, SLIGHTLY = 0.4, 0.05
+MIRRORED = 0.4
+SLIGHTLY = 0.05
 """Smallest difference of the strips farther from the seam, in the same unit, if they are smooth, and if they have
 detail. Mirrored strips and vignettes have about 0."""
 LEAST_DETAIL = 4.0
@@ -35,12 +37,16 @@ LEAST_DETAIL = 4.0
 LEAST_ALONG = 0.06
 """Smallest variation along the outermost columns, in the same unit; frames have none."""
 BLOCKS = 32
-MOST_AT_POLES, POLE_NOISE = 0.5, 2.0
+MOST_AT_POLES = 0.5
+POLE_NOISE = 2.0
 """Largest variation along the first and the last row, as a share of the one along other rows, and grey levels above
 that."""
-OUTSIDE, RING = 0.57, (0.33, 0.42)
+OUTSIDE = 0.57
+RING = (0.33, 0.42)
 """Distances from the middle of each half, in units of the height: beyond any fisheye's circle, and within its rim."""
-DARK, LIT, LEAST_LIT = 32.0, 12.0, 6
+DARK = 32.0
+LIT = 12.0
+LEAST_LIT = 6
 """Brightest grey level beyond the circles of fisheyes, how much brighter half of an eighth of a rim is, and the least
 number of such eighths; a letterbox has 4."""
 

@@ -10,23 +10,28 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import zoom
 
-CREAM = np.array((0.85, 0.81, 0.71), np.float32)
-INK = np.array((0.27, 0.31, 0.42), np.float32)
-BRICK = np.array((0.68, 0.45, 0.37), np.float32)
-MORTAR = np.array((0.73, 0.53, 0.45), np.float32)
-TEAL = np.array((0.28, 0.54, 0.56), np.float32)
-GOLD = np.array((0.87, 0.69, 0.38), np.float32)
-CORAL = np.array((0.82, 0.45, 0.38), np.float32)
-SLATE = np.array((0.47, 0.53, 0.60), np.float32)
-SKY = np.array((0.47, 0.64, 0.79), np.float32)
-LEAF = np.array((0.50, 0.62, 0.40), np.float32)
-BRICK_HUE = np.array((0.0, 0.02, 0.02), np.float32)
-GROUT = np.array((0.62, 0.58, 0.52), np.float32)
-VEIN = np.array((0.48, 0.58, 0.60), np.float32)
-STONE = np.array((0.86, 0.87, 0.84), np.float32)
-WALNUT = np.array((0.52, 0.38, 0.27), np.float32)
-OAK = np.array((0.68, 0.53, 0.38), np.float32)
-GAP = np.array((0.48, 0.35, 0.25), np.float32)
+
+def _color(*rgb: float) -> np.ndarray:
+    return np.array(rgb, np.float32)
+
+
+CREAM = _color(0.85, 0.81, 0.71)
+INK = _color(0.27, 0.31, 0.42)
+BRICK = _color(0.68, 0.45, 0.37)
+MORTAR = _color(0.73, 0.53, 0.45)
+TEAL = _color(0.28, 0.54, 0.56)
+GOLD = _color(0.87, 0.69, 0.38)
+CORAL = _color(0.82, 0.45, 0.38)
+SLATE = _color(0.47, 0.53, 0.60)
+SKY = _color(0.47, 0.64, 0.79)
+LEAF = _color(0.50, 0.62, 0.40)
+BRICK_HUE = _color(0.0, 0.02, 0.02)
+GROUT = _color(0.62, 0.58, 0.52)
+VEIN = _color(0.48, 0.58, 0.60)
+STONE = _color(0.86, 0.87, 0.84)
+WALNUT = _color(0.52, 0.38, 0.27)
+OAK = _color(0.68, 0.53, 0.38)
+GAP = _color(0.48, 0.35, 0.25)
 
 
 def coordinates(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
@@ -71,7 +76,8 @@ def mosaic(rng: np.random.Generator, side: int, ring: int) -> np.ndarray:
     """Return a round mosaic of rings of nearly square stones, `ring` texels wide, in bands of zigzags, checks and
     stripes."""
     y, x = (np.indices((side, side), np.float32) + 0.5) - side / 2
-    radius, angle = np.hypot(x, y) / ring, np.arctan2(y, x) / (2 * np.pi) + 0.5
+    radius = np.hypot(x, y) / ring
+    angle = np.arctan2(y, x) / (2 * np.pi) + 0.5
     index = radius.astype(int)
     sectors = 6 * np.maximum(index, 1)  # 2πr ≈ 6r: stones of ring r are nearly square.
     along = angle * sectors

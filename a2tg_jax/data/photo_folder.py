@@ -50,7 +50,8 @@ NOT_PHOTOGRAPHS = re.compile(
 )
 """Words in names of folders, and in names of files around the name of a photograph."""
 THUMBNAIL = 32
-SMALLER_TOLERANCE, EQUAL_TOLERANCE = 2.0, 0.5
+SMALLER_TOLERANCE = 2.0
+EQUAL_TOLERANCE = 0.5
 """Largest mean difference in grey levels of thumbnails between a photograph and its copy, smaller or of its size.
 
 Copies at 1/4 differ by up to 1.2, neighbouring frames of six captures by at least 2.4.
@@ -108,7 +109,8 @@ def find_photos(folder: Path, least: int = LEAST_PHOTOS, chosen: Sequence[Path] 
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder of photographs, photograph or video")
     for file in chosen or ():
-        if (hint := capture_hint(file)) is not None:
+        hint = capture_hint(file)
+        if hint is not None:
             raise ValueError(f"{file}: {hint}")
     files = sorted(file.relative_to(folder) for file in (_files_below(folder) if chosen is None else set(chosen)))
     names = [file.as_posix() for file in files if file.suffix.lower() in PHOTO_SUFFIXES]
@@ -245,7 +247,8 @@ def _copies(folder: Path, names: Sequence[str]) -> set[str]:
 
     def is_copy(name: str, larger: str) -> bool:
         """Return whether two pictures have the same aspect, up to a pixel of rounding, and show the same."""
-        (size, grey), (larger_size, larger_grey) = pictures[name], pictures[larger]
+        size, grey = pictures[name]
+        larger_size, larger_grey = pictures[larger]
         # A side rounded by a pixel changes w·H - h·W by H or W.
         if abs(size[0] * larger_size[1] - size[1] * larger_size[0]) > sum(larger_size):
             return False

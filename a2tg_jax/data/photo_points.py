@@ -58,7 +58,9 @@ class Look:
         viewmat: [4, 4] world to camera.
         K: [3, 3] in pixels of the picture.
         """
-        pixels, self.viewmat, self.K = picture.read(), viewmat, K
+        pixels = picture.read()
+        self.viewmat = viewmat
+        self.K = K
         self.size = pixels.shape[:2]
         factor = max(1, round(max(self.size) / SIDE))
         step = max(1, factor // 4)  # Some of many pixels are enough for a mean.
@@ -70,7 +72,8 @@ class Look:
         opacity = pixels[..., 3:] if pixels.shape[2] == 4 else np.ones_like(counts)
         columns = [counts, counts * opacity, counts * opacity * pixels[..., :3]]
         means = _averaged(np.concatenate(columns, axis=2), self.factor // step)
-        self.counts, self.opacity = means[..., 0], means[..., 1] / np.maximum(means[..., 0], LEAST)
+        self.counts = means[..., 0]
+        self.opacity = means[..., 1] / np.maximum(self.counts, LEAST)
         self.colors = means[..., 2:] / np.maximum(means[..., 1:2], LEAST)
         ranges = maximum_filter(self.colors, (3, 3, 1)) - minimum_filter(self.colors, (3, 3, 1))
         is_opaque = bool(((self.opacity >= 1 - TRANSPARENT) | (self.counts <= 0.5)).all())
@@ -79,12 +82,13 @@ class Look:
     def at(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return colours [P, 3] of points, NaN where they are not shown, their cells [P], -1 there and where the
         photograph is plain, and whether they are before a transparent pixel [P]."""
-        own = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
+        in_frame = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
         with np.errstate(divide="ignore", invalid="ignore"):
-            x, y = pinhole_pixels(own, self.K).T
+            x, y = pinhole_pixels(in_frame, self.K).T
         height, width = self.size
-        is_in = (own[:, 2] > NEAR_PLANE) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
-        column, row = (np.where(is_in, place, 0).astype(int) for place in (x, y))
+        is_in = (in_frame[:, 2] > NEAR_PLANE) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        column = np.where(is_in, x, 0).astype(int)
+        row = np.where(is_in, y, 0).astype(int)
         pixel = row // self.factor, column // self.factor
         is_in &= self.counts[pixel] > 0.5
         is_free = is_in & (self.opacity[pixel] < TRANSPARENT)
@@ -150,7 +154,10 @@ def _compared(looks: Sequence[Look], points: np.ndarray) -> _Compared:
     colors, cells, is_free = (np.stack(each) for each in zip(*(look.at(points) for look in looks), strict=True))
     num_seen = (~np.isnan(colors[..., 0])).sum(axis=0)
     kept = (is_free.sum(axis=0) <= max(1, MOST_SPOILT * len(looks))) & (num_seen > 0)
-    points, colors, cells, num_seen = points[kept], colors[:, kept], cells[:, kept], num_seen[kept]
+    points = points[kept]
+    colors = colors[:, kept]
+    cells = cells[:, kept]
+    num_seen = num_seen[kept]
     # Unseen colours are NaN, which is sorted to the end.
     middle = _at_share(colors, 0.5, num_seen)
     distances = np.abs(colors - middle).sum(axis=2)
@@ -164,8 +171,8 @@ def _best(found: _Compared) -> _Compared:
     """Return the candidate of the most similar colours in each cell of each photograph."""
     order = np.argsort(found.differences + FEW_VIEWS / found.num_seen, kind="stable")
     is_best = np.zeros(len(order), bool)
-    for own in found.cells[order].T:
-        cell, first = np.unique(own, return_index=True)
+    for cells in found.cells[order].T:
+        cell, first = np.unique(cells, return_index=True)
         is_best[order[first[cell >= 0]]] = True
     return found.at(np.flatnonzero(is_best))
 

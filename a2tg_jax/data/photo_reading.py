@@ -11,8 +11,10 @@ Next to the folder `images` may be
 """
 
 import contextlib
+import functools
 import os
 import warnings
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -27,11 +29,10 @@ from a2tg_jax.data.image_files import find_image, map_in_threads, on_disk
 from a2tg_jax.data.lenses import Lens, LensUse, resize_pixels
 from a2tg_jax.data.photo_store import DepthMap, Mask, Shelf
 from a2tg_jax.host.npz import read_npy
-from a2tg_jax.host.regular_files import is_folder
-from a2tg_jax.host.remote_files import Unreachable, is_remote
 from a2tg_jax.host.text import shortened
 
-MASKS, DEPTHS = "masks", "depths"
+MASKS = "masks"
+DEPTHS = "depths"
 HALF = 128
 """Level from which on a pixel of a mask is bright."""
 AlphaMeaning = Literal["transparency", "mask"]
@@ -91,13 +92,14 @@ class Photo(NamedTuple):
     """Number of the panorama that it was cut from."""
 
 
-class _Found(NamedTuple):
-    """A photograph with its files, and the factors by which their pixels are downscaled."""
+class _Files(NamedTuple):
+    """The files of a photograph, and the factors by which their pixels are downscaled."""
 
     photo: Photo
-    file: Path
+    image: Path
     downscale: int
-    mask: tuple[Path, int] | None
+    mask: Path | None
+    mask_downscale: int
     depths: Path | None
 
 
@@ -113,33 +115,43 @@ def read_photos(
       root: the scene's folder, which has no smaller copies: its siblings are other scenes.
       how_to_remove: function from an image name to advice on removing it from the scene.
     """
-    found = _find_files(photos, options.downscale, place, root, how_to_remove)
+    files = _find_files(photos, options.downscale, root, how_to_remove)
     names: dict[Path, str] = {}
-    for own in found:  # Where capitals or suffixes were lost, one file may fit two names.
-        if names.setdefault(own.file, own.photo.name) != own.photo.name:
+    for each in files:  # Where capitals or suffixes were lost, one file may fit two names.
+        name = names.setdefault(each.image, each.photo.name)
+        if name != each.photo.name:
             raise ValueError(
-                f"{own.file}: is the only file for {names[own.file]} and {own.photo.name}; put both there, or remove "
-                "one from the scene"
+                f"{each.image}: is the only file for {name} and {each.photo.name}; put both there, or remove one from "
+                "the scene"
             )
-    read = map_in_threads(lambda own: _read(own, options), found, place=place)
-    shots = [shot for shot, _ in read]
-    lacking = [own.photo.name for own in found if own.mask is None]
-    if len(lacking) == len(found):
-        folders = {photo.below_images[0].with_name(MASKS) for photo in photos if photo.below_images}
-        for folder in filter(is_folder, folders):
-            message = f"{folder}: holds no mask of a photograph of the scene, called NAME.jpg.png or NAME.png: not used"
-            warnings.warn(message, stacklevel=3)
-        for root in {folder.parent for folder in folders if isinstance(folder, Path)}:
-            for folder in sorted(root.glob("*[mM]ask*/")):
-                if not folder.name.startswith(MASKS):
-                    warnings.warn(f"{folder}: not read; if it holds masks, rename it to {MASKS}", stacklevel=3)
-    elif lacking:
-        message = f"{place}: {len(lacking)} of {len(shots)} photographs have no mask, such as {lacking[0]}"
-        warnings.warn(f"{message}: all of their pixels count", stacklevel=3)
-    masks = [own.mask[0] for own in found if own.mask is not None]
-    grey = [own.mask[0] for own, (_, has_grey_mask) in zip(found, read, strict=True) if own.mask and has_grey_mask]
-    warn_of_grey(grey, masks)
-    return shots
+    read = map_in_threads(lambda each: _read(each, options), files)
+    masks = [each.mask for each in files if each.mask is not None]
+    lacking = [each.photo.name for each in files if each.mask is None]
+    if not masks:
+        _warn_of_unused_masks(photos)
+    else:
+        warn_of_lacking_masks(place, lacking, len(files))
+    warn_of_grey([grey for _, grey in read if grey is not None], masks)
+    return [shot for shot, _ in read]
+
+
+def _warn_of_unused_masks(photos: Sequence[Photo]) -> None:
+    """Warn of folders that may hold masks, for a scene without any."""
+    folders = {photo.below_images[0].with_name(MASKS) for photo in photos if photo.below_images}
+    for folder in filter(Path.is_dir, folders):
+        message = f"{folder}: holds no mask of a photograph of the scene, called NAME.jpg.png or NAME.png: not used"
+        warnings.warn(message, stacklevel=4)
+    for root in {folder.parent for folder in folders}:
+        for folder in sorted(root.glob("*[mM]ask*/")):
+            if not folder.name.startswith(MASKS):
+                warnings.warn(f"{folder}: not read; if it holds masks, rename it to {MASKS}", stacklevel=4)
+
+
+def warn_of_lacking_masks(place: Path, lacking: Sequence[str], num: int) -> None:
+    """Warn of the photographs, among `num`, that have no mask although others have."""
+    if lacking:
+        message = f"{place}: {len(lacking)} of {num} photographs have no mask, such as {lacking[0]}"
+        warnings.warn(f"{message}: all of their pixels count", stacklevel=4)
 
 
 def warn_of_grey(grey: Sequence[Path], masks: Sequence[Path]) -> None:
@@ -153,113 +165,134 @@ def warn_of_grey(grey: Sequence[Path], masks: Sequence[Path]) -> None:
         )
 
 
-def _read(found: _Found, options: Options) -> tuple[Shot, bool]:
-    """Read a photograph, and undistort and downscale it. Also return whether its mask file has areas that are neither
+def _read(files: _Files, options: Options) -> tuple[Shot, Path | None]:
+    """Read a photograph, and undistort and downscale it. Also return its mask file if that has areas that are neither
     black nor white."""
-    photo, file, downscale, _, depths = found
-    photograph = read_pixels(file)
-    stored = photograph.shape[1], photograph.shape[0]
-    lens = photo.lens
+    photo = files.photo
+    photograph = read_pixels(files.image)
+    height, width = photograph.shape[:2]
+    stored = (width, height)
+    lens = _lens_of(files, stored, options.downscale)
+    mask = None if files.mask is None else read_mask(files.mask, stored, lens.size)
+    cuts_out = options.mask_as == "background"
+
+    def whole_view(pixels: np.ndarray) -> np.ndarray:
+        """Return the view's pixels from the file's."""
+        if cuts_out and files.mask is not None:
+            # Read again: held masks of all photographs would take much memory.
+            pixels = _cut_out(pixels, read_mask(files.mask, stored, lens.size).counts)
+        return lens.view_pixels(pixels, files.downscale)[0]
+
+    def view(pixels: np.ndarray) -> np.ndarray:
+        pixels = whole_view(pixels)
+        return pixels[..., :3] if options.alpha == "mask" else pixels
+
+    try:
+        size, K = lens.view_of(stored, files.downscale)
+        rays = lens.rays(*size)
+    except ValueError as error:
+        raise ValueError(f"{photo.what}: its camera model {error}") from None
+    pixels = whole_view(photograph)
+    is_stored = pixels is photograph
+    counts = None
+    if mask is None:
+        counts = None if photo.counted is None else photo.counted(pixels)
+    elif not cuts_out:
+        counts = _view_mask(mask.counts, files.mask_downscale, lens, size)
+    if options.alpha == "mask" and pixels.shape[2] == 4:
+        is_opaque = pixels[..., 3] == 255
+        counts = is_opaque if counts is None else is_opaque & counts
+        pixels = np.ascontiguousarray(pixels[..., :3])  # A view would keep the alpha channel in memory.
+        is_stored = False
+    shot = Shot(
+        photo.name,
+        photo.viewmat,
+        K,
+        options.shelf.keep(pixels, files.image, None if is_stored else view),
+        None if counts is None else Mask.of(counts),
+        rays,
+        None if files.depths is None else _depth_map(files.depths, lens, stored, size),
+        photo.panorama,
+    )
+    return shot, files.mask if mask is not None and mask.has_grey_areas else None
+
+
+def _lens_of(files: _Files, stored: tuple[int, int], downscale: int) -> Lens:
+    """Return the lens of a photograph whose file is of a size (width, height); ValueError: of another aspect."""
+    lens = files.photo.lens
     if not isinstance(lens, Lens):
         full = stored
-        if downscale < options.downscale:  # The file is a smaller copy, and the full image may be missing.
-            full = options.downscale * stored[0], options.downscale * stored[1]
-            # In object storage, each size would be another request.
-            if not is_remote(file) and (original := find_image(*photo.image)) is not None:
-                full = picture_size(original)
+        if files.downscale < downscale:  # The file is a smaller copy, and the full image may be missing.
+            original = find_image(*files.photo.image)
+            full = (downscale * stored[0], downscale * stored[1]) if original is None else picture_size(original)
         lens = lens(full)
-    (width, height), (camera_width, camera_height) = stored, lens.size
+    width, height = stored
+    camera_width, camera_height = lens.size
     ratio = (width * camera_height) / (height * camera_width)
     if abs(ratio - 1) > max(MAX_ASPECT_ERROR, 1 / min(stored)):  # Or a pixel of the shorter side.
         is_turned = (height, width) == lens.size
         advice = "write it turned as EXIF says (magick mogrify -auto-orient FILE), or " if is_turned else ""
         raise ValueError(
-            f"{file}: is {width}x{height}, but its camera is {camera_width}x{camera_height}, of another aspect; "
+            f"{files.image}: is {width}x{height}, but its camera is {camera_width}x{camera_height}, of another aspect; "
             f"{advice}use the image that the camera was estimated from"
         )
-
-    mask_file, cuts_out = found.mask, options.mask_as == "background"
-
-    def whole_view(pixels: np.ndarray) -> np.ndarray:
-        if mask_file is not None and cuts_out:
-            pixels = _cut_out(pixels, read_mask(mask_file[0], stored, lens.size).counts)
-        return lens.view_pixels(pixels, downscale)[0]
-
-    def view(pixels: np.ndarray) -> np.ndarray:
-        return whole_view(pixels)[..., :3] if options.alpha == "mask" else whole_view(pixels)
-
-    try:
-        size, K = lens.view_of(stored, downscale)
-        rays = lens.rays(*size)
-    except ValueError as error:
-        raise ValueError(f"{photo.what}: its camera model {error}") from None
-    pixels = whole_view(photograph)
-    is_stored, counts = pixels is photograph, None
-    mask = None if mask_file is None else read_mask(mask_file[0], stored, lens.size)
-    if mask is not None and mask_file is not None and not cuts_out:
-        counts = _view_mask(mask.counts, mask_file[1], lens, size)
-    elif mask is None and photo.counted is not None:
-        counts = photo.counted(pixels)
-    if options.alpha == "mask" and pixels.shape[2] == 4:
-        is_opaque = pixels[..., 3] == 255
-        counts = is_opaque if counts is None else is_opaque & counts
-        # A view would keep the alpha channel in memory.
-        pixels, is_stored = np.ascontiguousarray(pixels[..., :3]), False
-    picture = options.shelf.keep(pixels, file, None if is_stored else view)
-    own_mask = None if counts is None else Mask.of(counts)
-    depth = None if depths is None else _depth_map(depths, lens, stored, size)
-    shot = Shot(photo.name, photo.viewmat, K, picture, own_mask, rays, depth, photo.panorama)
-    return shot, mask is not None and mask.has_grey_areas
+    return lens
 
 
 def _find_files(
-    photos: Sequence[Photo], downscale: int, place: Path, root: Path, how_to_remove: Callable[[str], str]
-) -> list[_Found]:
+    photos: Sequence[Photo], downscale: int, root: Path, how_to_remove: Callable[[str], str]
+) -> list[_Files]:
     """Return the files of photographs, from folders of smaller copies where they are complete."""
-
-    def find_mask(photo: Photo) -> tuple[Path, str] | None:
-        """Return the folder of the full mask, and the mask's path below it."""
-        if photo.mask is not None:
-            return photo.mask.parent, photo.mask.name
-        if photo.below_images is None:
-            return None
-        images, name = photo.below_images
-        folder = images.with_name(MASKS)
-        for each in (folder, folder.with_name(f"{MASKS}_{downscale}"))[: 2 if downscale > 1 else 1]:
-            if (found := on_disk(each, *mask_names(name))) is not None:
-                return folder, found.relative_to(each).as_posix()
-        return None
-
-    masks = map_in_threads(find_mask, photos, place=place)
+    masks = map_in_threads(lambda photo: _full_mask(photo, downscale), photos)
     named = [*(photo.image for photo in photos), *(mask for mask in masks if mask is not None)]
     copies = _find_copies(named, downscale, root)
 
-    def find(photo: Photo, mask: tuple[Path, str] | None) -> _Found | None:
-        (folder, name), mask_file = photo.image, None
+    def find(photo: Photo, mask: tuple[Path, str] | None) -> _Files | None:
+        folder, name = photo.image
         image = find_image(copies.get(folder, folder), name)
+        mask_file = None
+        mask_downscale = downscale
         if mask is not None:
-            found = on_disk(copies.get(mask[0], mask[0]), mask[1])
-            mask_file = None if found is None else (found, 1 if mask[0] in copies else downscale)
-            if found is None and photo.mask is not None:
+            mask_folder, mask_name = mask
+            mask_file = on_disk(copies.get(mask_folder, mask_folder), mask_name)
+            mask_downscale = 1 if mask_folder in copies else downscale
+            if mask_file is None and photo.mask is not None:
                 raise FileNotFoundError(
                     f"{photo.mask}: no such mask, but the scene names it; add the mask or remove its mask_path"
                 )
         depths = photo.depths
         if depths is None and photo.below_images is not None:
             depths = find_depths(*photo.below_images)
-        factor = 1 if folder in copies else downscale
-        return None if image is None else _Found(photo, image, factor, mask_file, depths)
+        if image is None:
+            return None
+        return _Files(photo, image, 1 if folder in copies else downscale, mask_file, mask_downscale, depths)
 
-    files = map_in_threads(find, photos, masks, place=place)
-    missing = [photo.image for photo, own in zip(photos, files, strict=True) if own is None]
+    found = map_in_threads(find, photos, masks)
+    missing = [photo.image for photo, files in zip(photos, found, strict=True) if files is None]
     if missing:
-        (folder, name), num = missing[0], len(missing)
-        more = f", and {num - 1} more of its {len(photos)} are missing" if num > 1 else ""
+        folder, name = missing[0]
+        others = f", and {len(missing) - 1} more of its {len(photos)} are missing" if len(missing) > 1 else ""
         raise FileNotFoundError(
-            f"{copies.get(folder, folder) / name}: no such image, but the scene has a camera for it{more}; put it "
+            f"{copies.get(folder, folder) / name}: no such image, but the scene has a camera for it{others}; put it "
             f"there, or {how_to_remove(name)}"
         )
-    return [own for own in files if own is not None]
+    return [files for files in found if files is not None]
+
+
+def _full_mask(photo: Photo, downscale: int) -> tuple[Path, str] | None:
+    """Return the folder of a photograph's full mask, and the mask's path below it, from the mask or a smaller copy."""
+    if photo.mask is not None:
+        return photo.mask.parent, photo.mask.name
+    if photo.below_images is None:
+        return None
+    images, name = photo.below_images
+    folder = images.with_name(MASKS)
+    folders = [folder, images.with_name(f"{MASKS}_{downscale}")] if downscale > 1 else [folder]
+    for each in folders:
+        file = on_disk(each, *mask_names(name))
+        if file is not None:
+            return folder, file.relative_to(each).as_posix()
+    return None
 
 
 def _find_copies(files: Sequence[tuple[Path, str]], downscale: int, root: Path) -> dict[Path, Path]:
@@ -267,45 +300,51 @@ def _find_copies(files: Sequence[tuple[Path, str]], downscale: int, root: Path) 
 
     Such a folder may also be another clip of the scene. It counts if the scene names no file in it, and it has a copy
     of each file of NAME, 1/k as large. A folder that fails is not used, with a warning. Files whose full size is
-    missing, cannot be read or is in object storage are not compared.
+    missing or cannot be read are not compared.
 
     Args:
       files: folder, and path below it, of every photograph and mask that the scene names.
       downscale: k >= 1.
       root: as in `read_photos`.
     """
-
-    def difference(name: str) -> str:
-        """Return how the copy of a file differs from one of 1/downscale of its size; "" if it does not."""
-        full, copy = (find_image(each, name) for each in (folder, smaller))
-        if full is None:
-            return ""
-        if copy is None:
-            return f"{name}, which is missing"
-        if is_remote(full):
-            return ""
-        with contextlib.suppress(ValueError):  # A photograph may be too large to be read in full.
-            size, copied = picture_size(full), picture_size(copy)
-            if any(abs(side - whole / downscale) > ROUNDING for side, whole in zip(copied, size, strict=True)):
-                return f"{name}, which is {copied[0]}x{copied[1]} for {size[0]}x{size[1]}"
-        return ""
-
-    found: dict[Path, Path] = {}
-    named = {(folder / name).parent for folder, name in files} if downscale > 1 else set()
-    for folder in dict.fromkeys(folder for folder, _ in files if downscale > 1 and folder != root):
+    if downscale == 1:
+        return {}
+    names: dict[Path, list[str]] = defaultdict(list)
+    for folder, name in files:
+        names[folder].append(name)
+    named = {(folder / name).parent for folder, name in files}
+    copies: dict[Path, Path] = {}
+    for folder, of_folder in names.items():
         smaller = folder.with_name(f"{folder.name}_{downscale}")
-        if not is_folder(smaller) or any(each.is_relative_to(smaller) for each in named):
+        if folder == root or not smaller.is_dir() or any(each.is_relative_to(smaller) for each in named):
             continue
-        names = [name for own, name in files if own == folder]
-        if unlike := [each for each in map_in_threads(difference, names, place=folder) if each]:
+        compare = functools.partial(_difference_of_copy, folder, smaller, downscale)
+        unlike = [difference for difference in map_in_threads(compare, of_folder) if difference]
+        if unlike:
             warnings.warn(
                 f"{smaller}: does not hold the files of {folder} at 1/{downscale} of their size, for {len(unlike)} of "
-                f"{len(names)}, such as {unlike[0]}: not used",
+                f"{len(of_folder)}, such as {unlike[0]}: not used",
                 stacklevel=4,
             )
         else:
-            found[folder] = smaller
-    return found
+            copies[folder] = smaller
+    return copies
+
+
+def _difference_of_copy(folder: Path, smaller: Path, downscale: int, name: str) -> str:
+    """Return how the copy of a file differs from one of 1/downscale of its size; "" if it does not."""
+    full = find_image(folder, name)
+    copy = find_image(smaller, name)
+    if full is None:
+        return ""
+    if copy is None:
+        return f"{name}, which is missing"
+    with contextlib.suppress(ValueError):  # A photograph may be too large to be read in full.
+        size = picture_size(full)
+        copied = picture_size(copy)
+        if np.abs(np.subtract(copied, np.divide(size, downscale))).max() > ROUNDING:
+            return f"{name}, which is {copied[0]}x{copied[1]} for {size[0]}x{size[1]}"
+    return ""
 
 
 def mask_names(name: str) -> tuple[str, str, str]:
@@ -354,9 +393,12 @@ def read_mask(file: Path, *sizes: tuple[int, int]) -> MaskFile:
         # black. A file with a mask in both excludes what either does.
         has_both = 0 < len(lit) < is_opaque.sum() and (lit[:, :3] == lit[0, :3]).all()
         counts = is_opaque & counts if has_both else is_opaque
-    if counts.shape[::-1] not in sizes:
-        found, wanted = (f"{width}x{height}" for width, height in (counts.shape[::-1], sizes[0]))
-        raise ValueError(f"{file}: is {found}, but its photograph is {wanted}; a mask must be of the same size")
+    height, width = counts.shape
+    if (width, height) not in sizes:
+        wanted = f"{sizes[0][0]}x{sizes[0][1]}"
+        raise ValueError(
+            f"{file}: is {width}x{height}, but its photograph is {wanted}; a mask must be of the same size"
+        )
     return MaskFile(counts, has_grey_areas)
 
 
@@ -412,8 +454,6 @@ def read_depths(file: str | os.PathLike[str]) -> np.ndarray:
     if str(file).endswith(".npy"):
         try:
             values = read_npy(file)
-        except Unreachable:
-            raise
         except Exception as error:  # Damaged files raise anything from SyntaxError to struct.error.
             if str(error).startswith(f"{file}: "):  # It says already which file and what to do.
                 raise

@@ -1,12 +1,10 @@
 """What views hold of their photographs: pixels, masks and depth maps; and the store that keeps pixels.
 
-Pixels are in memory while there is room, and otherwise read on demand from a disk or object storage.
+Pixels are in memory while there is room, and otherwise read on demand from a disk.
 """
 
-import contextlib
 import dataclasses
 import os
-import shutil
 import tempfile
 import threading
 import weakref
@@ -21,15 +19,12 @@ from numpy.typing import DTypeLike
 from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.data.decoding import read_pixels
 from a2tg_jax.host.machine import memory_limit
-from a2tg_jax.host.remote_files import is_remote
 from a2tg_jax.host.startup import cache_folder
 
 Processing = Callable[[np.ndarray], np.ndarray]
 """Function from the pixels in an image file to undistorted or resized ones."""
 SHARE_OF_MEMORY = 0.25
 """Share of the process's memory for photographs; those beyond it stay on disk."""
-SHARE_OF_DISK = 0.5
-"""Share of the free disk for undistorted or resized photographs of object storage."""
 
 
 def how_to_convert(values: object, name: str) -> str:
@@ -56,8 +51,6 @@ class Picture(NamedFields):
     """Whether they are in memory."""
     dtype: DTypeLike = np.uint8
     """Type of the pixels."""
-    is_remote: bool = False
-    """Whether reading waits for object storage."""
     checksum: int | None = None
     """CRC-32 of its pixels; None if they have not been read."""
 
@@ -94,7 +87,7 @@ class Picture(NamedFields):
         return Picture.of, (self.read(),)
 
     def __repr__(self) -> str:
-        place = "in memory" if self.is_held else "in object storage" if self.is_remote else "on disk"
+        place = "in memory" if self.is_held else "on disk"
         return f"Picture({np.dtype(self.dtype)}{[*self.shape]}, {place})"
 
     @property
@@ -201,8 +194,7 @@ class Shelf:
 
     Beyond the memory limit, pixels of an unchanged image file are dropped: decoding it again takes less time than a
     training step of that size. Undistorted or resized pixels go to an unnamed file in `cache_folder()`, which
-    disappears with the process, however that ends. Pixels of remote files take a share of the disk; the others are
-    made again.
+    disappears with the process, however that ends.
     """
 
     def __init__(self, room: int | None = None):
@@ -213,7 +205,6 @@ class Shelf:
         self._lock = threading.Lock()
         self._file: BinaryIO | None = None
         self._end = 0
-        self._disk: int | None = None
 
     def keep(self, pixels: np.ndarray, source: Path, view: Processing | None = None) -> Picture:
         """Return a picture of these pixels, uint8 of any shape.
@@ -234,18 +225,20 @@ class Shelf:
     def _left(self, pixels: np.ndarray, source: Path, view: Processing | None) -> Picture:
         """Return a picture of pixels without room in memory. Arguments as for `keep`."""
         checksum = _checksum(pixels)
-        if view is None or (is_remote(source) and not self._takes_disk(pixels.nbytes)):
+        if view is None:
             # docs/reliability.md, "Photographs beyond the memory"
             read_again = _FileRead(source, view, checksum)
-            return Picture(pixels.shape, read_again, is_remote=is_remote(source), checksum=checksum)
-        folder, shape = cache_folder(), pixels.shape
+            return Picture(pixels.shape, read_again, checksum=checksum)
+        folder = cache_folder()
+        shape = pixels.shape
         try:
             with self._lock:
                 if self._file is None:
                     folder.mkdir(parents=True, exist_ok=True)
                     self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - as long as there are pictures
                     weakref.finalize(self, self._file.close)
-                file, start = self._file, self._end
+                file = self._file
+                start = self._end
                 file.seek(start)
                 file.write(np.ascontiguousarray(pixels).data)
                 file.flush()
@@ -262,24 +255,6 @@ class Shelf:
             return again
 
         return Picture(shape, read, checksum=checksum)
-
-    def _takes_disk(self, num_bytes: int) -> bool:
-        """Reserve bytes in the share of the disk for pictures of remote files; return whether it had them.
-
-        There is no share if no file can be made there.
-        """
-        with self._lock:
-            if self._disk is None:
-                folder = cache_folder()
-                self._disk = 0
-                with contextlib.suppress(OSError):
-                    folder.mkdir(parents=True, exist_ok=True)
-                    if os.access(folder, os.W_OK):
-                        self._disk = int(SHARE_OF_DISK * shutil.disk_usage(folder).free)
-            if num_bytes > self._disk:
-                return False
-            self._disk -= num_bytes
-            return True
 
 
 def _checksum(pixels: np.ndarray) -> int:

@@ -20,7 +20,9 @@ NEW_TYPES = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "
 NUMPY_TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 PLY_TYPES = dict(zip(OLD_TYPES + NEW_TYPES, NUMPY_TYPES * 2, strict=True))
 BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-LONGEST_LINE, MOST_LINES, MOST_DIGITS = 4096, 10_000, 20
+LONGEST_LINE = 4096
+MOST_LINES = 10_000
+MOST_DIGITS = 20
 NOT_NUMBERS = re.compile(rb"[+-]?(1\.#\w+|nan\(\w*\))", re.IGNORECASE)
 """Words such as -nan(ind) and 1.#QNAN."""
 OFFSET = "offset"
@@ -31,7 +33,8 @@ RGB = ("red", "green", "blue")
 COLORS = (RGB, ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 """Names of colours, in order of preference."""
 SH_DEGREE0 = ("f_dc_0", "f_dc_1", "f_dc_2")
-FLOAT_RANGES, INTEGER_RANGES = (1, 255, 65535), (255, 65535, 2**32 - 1)
+FLOAT_RANGES = (1, 255, 65535)
+INTEGER_RANGES = (255, 65535, 2**32 - 1)
 """Largest values of colours in files."""
 
 
@@ -43,7 +46,9 @@ class PlyFile:
     """
 
     def __init__(self, file: BinaryIO, path: Path):
-        self.path, self.encoding, self._file = path, "", file
+        self.path = path
+        self.encoding = ""
+        self._file = file
         self.comments: list[list[str]] = []
         self.counts: dict[str, int] = {}
         self.fields: dict[str, dict[str, str]] = {}
@@ -68,9 +73,10 @@ class PlyFile:
                     self.encoding = encoding
                 case ["element", name, number]:
                     if name in self.counts or not number.isdecimal() or len(number) > MOST_DIGITS:
-                        found = f"{shortened(number)} of {shortened(name)}"
-                        raise ValueError(f"{path}: announces {found}; a number is expected, once for each element")
-                    self.counts[name], self.fields[name] = int(number), {}
+                        got = f"{shortened(number)} of {shortened(name)}"
+                        raise ValueError(f"{path}: announces {got}; a number is expected, once for each element")
+                    self.counts[name] = int(number)
+                    self.fields[name] = {}
                 case ["property", kind, field] if name and kind in PLY_TYPES and field not in self.fields[name]:
                     self.fields[name][field] = PLY_TYPES[kind]
                 # A list, an unknown type or a second one of its name; an error only if the element is read.
@@ -84,7 +90,8 @@ class PlyFile:
         """Raise ValueError unless an element can be read and has the named properties."""
         if element in self._unreadable:
             raise ValueError(f"{self.path}: cannot read the {element} property '{self._unreadable[element]}'")
-        if missing := [name for name in names if name not in self.fields[element]]:
+        missing = [name for name in names if name not in self.fields[element]]
+        if missing:
             raise ValueError(f"{self.path}: has no attribute {', '.join(missing)}; {wanted} is expected")
 
     def require_vertices(self, names: Iterable[str], wanted: str) -> None:
@@ -106,10 +113,13 @@ class PlyFile:
         Raises:
           ValueError: if they are cut off, or no numbers.
         """
-        count, fields, is_text = self.counts[element], self.fields[element], self.encoding == "ascii"
+        count = self.counts[element]
+        fields = self.fields[element]
+        is_text = self.encoding == "ascii"
         dtype = np.dtype([(name, BYTE_ORDERS[self.encoding] + kind) for name, kind in fields.items()])
         # No room is made for more rows than there can be: a number in text takes a digit and a separator.
-        size, start = 2 * len(fields) - 1 if is_text else dtype.itemsize, self._file.tell()
+        size = 2 * len(fields) - 1 if is_text else dtype.itemsize
+        start = self._file.tell()
         left = self._file.seek(0, os.SEEK_END) - start
         self._file.seek(start)
         if count * size > left:
@@ -131,9 +141,9 @@ class PlyFile:
             except ValueError:
                 numbers = []
             if len(numbers) != len(fields):
-                found = shortened(line.decode("ascii", "replace")) or "the end of the file"
+                got = shortened(line.decode("ascii", "replace")) or "the end of the file"
                 raise ValueError(
-                    f"{self.path}: row {index:,} (from 0) of {element} must be {len(fields)} numbers; got {found}; "
+                    f"{self.path}: row {index:,} (from 0) of {element} must be {len(fields)} numbers; got {got}; "
                     "export it again"
                 )
             rows[index] = numbers
@@ -142,8 +152,8 @@ class PlyFile:
     @property
     def offset(self) -> np.ndarray:
         """[3] float64 origin of positions: zeros without the comment "offset X Y Z"."""
-        found = self._comment(OFFSET, 3)
-        return np.zeros(3) if found is None else found
+        offset = self._comment(OFFSET, 3)
+        return np.zeros(3) if offset is None else offset
 
     @property
     def turn(self) -> np.ndarray:

@@ -22,10 +22,12 @@ NEAR = 1e-3
 LAMP = np.array([[-1.7], [-1.9], [3.1]], np.float32)
 """Centre of a spherical lamp."""
 LAMP_RADIUS = 0.35
-NUM_LAMP_RAYS, NUM_SKY_RAYS = 8, 16
+NUM_LAMP_RAYS = 8
+NUM_SKY_RAYS = 16
 SKY_REACH = 0.8
 """Largest distance at which a surface darkens a point."""
-SKY_LIGHT, LAMP_LIGHT = 0.48, 0.68
+SKY_LIGHT = 0.48
+LAMP_LIGHT = 0.68
 TEXELS_PER_SAMPLE = 8
 """Factor by which the grid of light is coarser than a surface's image."""
 Vector = tuple[float, float, float]
@@ -107,7 +109,8 @@ class Ball:
         return longitude, np.arccos(np.clip(z, -1, 1)) * np.float32(1 / np.pi)
 
     def place(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        longitude, polar = 2 * np.pi * (u - 0.5), np.pi * v
+        longitude = 2 * np.pi * (u - 0.5)
+        polar = np.pi * v
         sine = np.sin(polar)
         outward = np.stack([sine * np.cos(longitude), sine * np.sin(longitude), np.cos(polar)])
         return outward * self.radius + column(self.center), outward
@@ -125,30 +128,36 @@ class Block:
     @property
     def axes(self) -> np.ndarray:
         """[3, 3] rows are the cube's own axes in the world, divided by half its side."""
-        cosine, sine = np.cos(self.turn), np.sin(self.turn)
+        cosine = np.cos(self.turn)
+        sine = np.sin(self.turn)
         return np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]], np.float32) / np.float32(self.half_side)
 
     def hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         # A ray is in the cube where it is between the planes of all three axes at once.
-        entry, leaving = np.float32(NEAR), np.float32(np.inf)
-        start, step = self.axes @ (origins - column(self.center)), self.axes @ directions
-        for position, speed in zip(start, step, strict=True):
+        entry = np.float32(NEAR)
+        leaving = np.float32(np.inf)
+        positions = self.axes @ (origins - column(self.center))
+        for position, speed in zip(positions, self.axes @ directions, strict=True):
             inverse = 1 / np.where(np.abs(speed) < 1e-9, np.float32(1e-9), speed)  # No 1 / 0 for a ray along a face.
-            middle, reach = -position * inverse, np.abs(inverse)
-            entry, leaving = np.maximum(entry, middle - reach), np.minimum(leaving, middle + reach)
+            middle = -position * inverse
+            reach = np.abs(inverse)
+            entry = np.maximum(entry, middle - reach)
+            leaving = np.minimum(leaving, middle + reach)
         return np.where((entry < leaving) & (entry > NEAR), entry, np.float32(np.inf))
 
     def locate(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         x, y, z = self.axes @ (points - column(self.center))
         face = np.argmax(np.stack([x, y, -x, -y, z]), axis=0)
         # The inverse of `rights` and `downs` in place.
-        along, down = np.choose(face, [y, -x, -y, x, x]), np.where(face == 4, -y, -z)
+        along = np.choose(face, [y, -x, -y, x, x])
+        down = np.where(face == 4, -y, -z)
         inside = np.float32(0.9999)  # 1 would be on the next face of the image.
         return (face + np.clip(0.5 + 0.5 * along, 0, inside)) / 5, np.clip(0.5 + 0.5 * down, 0, inside)
 
     def place(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         face = np.minimum((u * 5).astype(int), 4)
-        along, down = 2 * (u * 5 - face) - 1, 2 * v - 1
+        along = 2 * (u * 5 - face) - 1
+        down = 2 * v - 1
         normals = np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, 1]], np.float32)[face].T
         rights = np.array([[0, 1, 0], [-1, 0, 0], [0, -1, 0], [1, 0, 0], [1, 0, 0]], np.float32)[face].T
         downs = np.array([*[[0, 0, -1]] * 4, [0, -1, 0]], np.float32)[face].T
@@ -227,7 +236,8 @@ def light(colored: list[tuple[ParametricSurface, np.ndarray]], rng: np.random.Ge
 
     Colours are [rows, columns, 3] float32 in [0, 1]; the generator turns the patterns of rays.
     """
-    shapes, surfaces = [shape for shape, _ in colored], []
+    shapes = [shape for shape, _ in colored]
+    surfaces = []
     for shape, colors in colored:
         rows, columns = (max(2, -(-size // TEXELS_PER_SAMPLE)) for size in colors.shape[:2])
         u, v = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)

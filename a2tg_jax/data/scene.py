@@ -18,7 +18,6 @@ from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.origin import BLACK, Origin
 from a2tg_jax.core.similarity import Similarity, check_similarity
 from a2tg_jax.data.photo_store import DepthMap, Mask, Picture
-from a2tg_jax.host.remote_files import is_remote
 from a2tg_jax.host.text import counted, in_bytes
 
 MANY_LENSES = 8
@@ -265,10 +264,9 @@ def view_image(view: View, background: Sequence[float] | np.ndarray | None = Non
     return alpha * color + (1 - alpha) * np.asarray(background, np.float32)
 
 
-def scene_name(folder: Path | str) -> str:
-    """Return the end of a folder's path or URL, from the last name that says more than "scene" or "colmap" does."""
-    is_url = isinstance(folder, str) or is_remote(folder)
-    # As in a path, the first part is the root, which is no name.
-    parts = ("", *str(folder).split("/")[2:]) if is_url else Path(folder).resolve().parts
+def scene_name(folder: Path) -> str:
+    """Return the end of a folder's path, from the last name that says more than "scene" or "colmap" does."""
+    # The first part is the root, which is no name.
+    parts = folder.resolve().parts
     specific = [at for at, part in enumerate(parts) if at and part.lower() not in GENERIC_NAMES]
     return "/".join(parts[specific[-1] if specific else -1 :])

@@ -4,9 +4,7 @@ import itertools
 import os
 import re
 import shutil
-import sys
 import tempfile
-import threading
 import warnings
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager, nullcontext, suppress
@@ -28,7 +26,7 @@ from a2tg_jax.data.photo_reading import HALF, MASKS
 from a2tg_jax.data.staging import Panorama, Staged, directions, stage
 from a2tg_jax.data.video import DEFAULT_FRAMES
 from a2tg_jax.host.machine import num_threads
-from a2tg_jax.host.progress_bars import counting, has_terminal, new_bar
+from a2tg_jax.host.progress_bars import clock, counting, ticking
 from a2tg_jax.host.regular_files import expanded
 from a2tg_jax.host.text import counted, first_names
 
@@ -44,12 +42,12 @@ MAX_EXHAUSTIVE = 200
 MIN_REGISTERED = 3
 PHOTOS_PER_CORE = 2
 """Photographs of which features are extracted together, so that the progress bar moves."""
-TICK = 0.5
 ADVICE = "take more, sharp and closer together: they should overlap by two thirds and show texture, unlike blank walls"
 NO_DEPTH = "photographs that match show no depth, as if taken from one spot or of a flat surface: walk between them"
 MOSTLY_FLAT = 0.9
 """Share of matching pairs without depth from which a warning follows. In six captures it is at most 0.71."""
-MOST_NAMED, MOST_GAPS = 24, 5
+MOST_NAMED = 24
+MOST_GAPS = 5
 """Largest numbers of photographs, and of gaps between photographs, that a message names."""
 FLAT = ("PLANAR", "PANORAMIC", "PLANAR_OR_PANORAMIC")
 """COLMAP's names of the relations between two photographs that show no depth."""
@@ -132,7 +130,8 @@ def run_sfm(
     with _new_folder(out), tempfile.TemporaryDirectory(dir=out, prefix="sfm-") as folder, _quiet():
         work = Path(folder)
         staged = stage(sources, work, masks=masks, frames=frames, panorama=panorama, progress=progress, tell=on_note)
-        names, given = staged.names, first_names([str(source) for source in sources])
+        names = staged.names
+        given = first_names([str(source) for source in sources])
         if len(names) < LEAST_PHOTOS:
             raise ValueError(f"{given}: {len(names)} photographs; at least {LEAST_PHOTOS} are needed")
         if matching == "auto":
@@ -146,8 +145,9 @@ def run_sfm(
         _check_models(models, names, given, matching, _read_matches(database))
         model = models[0]
         _turn_upright(model)
-        with _clock("undistorting", progress):
-            chosen, undistorted = work / "chosen", work / "undistorted"
+        with clock("undistorting", is_shown=progress):
+            chosen = work / "chosen"
+            undistorted = work / "undistorted"
             chosen.mkdir()
             model.write(chosen)  # undistort_images takes folders.
             pycolmap().undistort_images(undistorted, chosen, staged.folder)
@@ -171,17 +171,22 @@ def _undistort_alpha_and_masks(model: Any, photos: Path, undistorted: Path) -> N
 
     def undistort(number: int) -> None:
         image = model.image(number)
-        lens, target = lenses[image.camera_id], undistorted / "images" / image.name
+        lens = lenses[image.camera_id]
+        target = undistorted / "images" / image.name
         # Photographs with transparent pixels are staged as PNG.
-        if target.suffix.lower() == ".png" and (pixels := read_pixels(photos / image.name)).shape[2] == 4:
-            Image.fromarray(lens.view_pixels(pixels)[0]).save(target, "PNG")
-        name = f"{image.name}.png"
-        if (staged := photos.with_name(MASKS) / name).exists():
-            levels = lens.view_plane(read_pixels(staged)[..., 0].astype(np.float32))
-            mask = Image.fromarray(levels >= HALF).convert("L")
-            (undistorted / MASKS / name).parent.mkdir(parents=True, exist_ok=True)
+        if target.suffix.lower() == ".png":
+            pixels = read_pixels(photos / image.name)
+            if pixels.shape[2] == 4:
+                Image.fromarray(lens.view_pixels(pixels)[0]).save(target, "PNG")
+        mask = photos.with_name(MASKS) / f"{image.name}.png"
+        if mask.exists():
+            levels = lens.view_plane(read_pixels(mask)[..., 0].astype(np.float32))
             # COLMAP and `Lens` may round the size of an almost undistorted image differently.
-            mask.resize(picture_size(target), Image.Resampling.NEAREST).save(undistorted / MASKS / name)
+            size = picture_size(target)
+            resized = Image.fromarray(levels >= HALF).convert("L").resize(size, Image.Resampling.NEAREST)
+            target_mask = undistorted / MASKS / f"{image.name}.png"
+            target_mask.parent.mkdir(parents=True, exist_ok=True)
+            resized.save(target_mask)
 
     map_in_threads(undistort, model.reg_image_ids())
 
@@ -226,11 +231,14 @@ def list_photos(database: Path, staged: Staged, camera_model: str) -> None:
 
 def _extract_features(database: Path, folder: Path, names: list[str], progress: bool) -> None:
     colmap = pycolmap()
-    together, masks = PHOTOS_PER_CORE * num_threads(), folder.with_name(MASKS)
+    together = PHOTOS_PER_CORE * num_threads()
+    masks = folder.with_name(MASKS)
     masked = [name for name in names if (masks / f"{name}.png").exists()]
     # Of photographs without a mask COLMAP would take no features.
-    readers = [(colmap.ImageReaderOptions(mask_path=masks), masked)]
-    readers.append((colmap.ImageReaderOptions(), sorted(set(names) - set(masked))))
+    readers = [
+        (colmap.ImageReaderOptions(mask_path=masks), masked),
+        (colmap.ImageReaderOptions(), sorted(set(names) - set(masked))),
+    ]
     with counting("features", len(names), "photo", is_shown=progress) as bar:
         for reader, chosen in readers:
             for start in range(0, len(chosen), together):
@@ -253,10 +261,11 @@ def _match_features(database: Path, num_photos: int, seed: int, matching: Matchi
     ):
 
         def count() -> None:
-            if more := opened.num_verified_image_pairs() - bar.n:
+            more = opened.num_verified_image_pairs() - bar.n
+            if more:
                 bar.update(more)
 
-        with _ticking(count) if progress else nullcontext():
+        with ticking(count) if progress else nullcontext():
             match(database, verification_options=verification, device=colmap.Device.cpu)
         count()
 
@@ -334,8 +343,8 @@ def _check_models(
         return
     reasons = []
     if blank:
-        found = f"in {len(blank)} of them ({first_names(blank, MOST_NAMED)})"
-        reasons.append(f"COLMAP finds no features, as in blank or very blurred pictures, {found}")
+        where = f"in {len(blank)} of them ({first_names(blank, MOST_NAMED)})"
+        reasons.append(f"COLMAP finds no features, as in blank or very blurred pictures, {where}")
     if alone and num_pairs:
         reasons.append(
             f"{len(alone)} of them ({first_names(alone, MOST_NAMED)}) match no other: they show something else, are "
@@ -356,10 +365,11 @@ def _check_models(
             "(matching='exhaustive')"
         )
     if not is_scene:
-        found = f"only {len(placed)} of" if placed else "none of the"
+        share = f"only {len(placed)} of" if placed else "none of the"
         pairs = f"{counted(num_pairs, 'pair')} match{'es' if num_pairs == 1 else ''}"
-        raise ValueError("; ".join([f"{given}: {found} {len(names)} photographs could be placed ({pairs})", *reasons]))
-    if gaps := _gaps(names, placed):
+        raise ValueError("; ".join([f"{given}: {share} {len(names)} photographs could be placed ({pairs})", *reasons]))
+    gaps = _gaps(names, placed)
+    if gaps:
         reasons.append(f"to connect them, take more photographs between {first_names(gaps, MOST_GAPS)}")
     missing = f"{given}: {len(left_out)} of {len(names)} photographs could not be placed and are left out"
     warnings.warn("; ".join([f"{missing} ({first_names(left_out, MOST_NAMED)})", *reasons]), stacklevel=3)
@@ -404,36 +414,9 @@ def _new_folder(folder: Path) -> Iterator[None]:
 def _quiet() -> Iterator[None]:
     """Keep COLMAP's log to what ends the process for a while; its errors become exceptions."""
     logging = pycolmap().logging
-    level, logging.minloglevel = logging.minloglevel, logging.FATAL.value
+    level = logging.minloglevel
+    logging.minloglevel = logging.FATAL.value
     try:
         yield
     finally:
         logging.minloglevel = level
-
-
-@contextmanager
-def _clock(phase: str, progress: bool) -> Iterator[None]:
-    """Show the time since the start of a phase whose progress cannot be counted."""
-    if progress and not has_terminal():
-        print(f"{phase} …", file=sys.stderr, flush=True)
-        progress = False
-    with new_bar(desc=phase, bar_format="{desc}: {elapsed}", disable=not progress) as bar, _ticking(bar.refresh):
-        yield
-
-
-@contextmanager
-def _ticking(act: Callable[[], object]) -> Iterator[None]:
-    """Call a function twice a second while COLMAP works."""
-    ended = threading.Event()
-
-    def tick() -> None:
-        while not ended.wait(TICK):
-            act()
-
-    ticking = threading.Thread(target=tick, daemon=True)
-    ticking.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        ticking.join()

@@ -16,14 +16,14 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from PIL import Image
-from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from a2tg_jax.data.decoding import PictureFacts, picture_facts, read_pixels, save_upright
 from a2tg_jax.data.image_files import map_in_threads, on_disk
+from a2tg_jax.data.lenses import sampled
 from a2tg_jax.data.panoramas import Projection, projection_of
 from a2tg_jax.data.photo_folder import LEAST_PHOTOS, find_photos, is_video
-from a2tg_jax.data.photo_reading import HALF, MASKS, mask_names, read_mask, warn_of_grey
+from a2tg_jax.data.photo_reading import HALF, MASKS, mask_names, read_mask, warn_of_grey, warn_of_lacking_masks
 from a2tg_jax.data.video import extract_frames
 from a2tg_jax.host.text import counted
 
@@ -39,7 +39,6 @@ FIELD_OF_VIEW = np.deg2rad(100.0)
 """Field of view of each square view of a panorama; with the headings below no direction is left out."""
 AROUND = 6
 """Number of views around the horizon; one view up and one down join them."""
-ROWS_AT_ONCE = 128  # Rays of a whole view would take many times its memory.
 
 
 class CameraGroup(NamedTuple):
@@ -119,8 +118,10 @@ def stage(
     for source in sources:
         if is_video(source) or not source.is_file():
             chosen[source] = None
-        elif (own := chosen.setdefault(source.parent, [])) is not None:
-            own.append(source)
+            continue
+        of_folder = chosen.setdefault(source.parent, [])
+        if of_folder is not None:
+            of_folder.append(source)
     least = LEAST_PHOTOS if len(chosen) == 1 else 1
     prefixes = _prefixes(list(chosen))
     for number, (source, prefix) in enumerate(zip(chosen, prefixes, strict=True)):
@@ -157,9 +158,8 @@ def stage(
     lacking = [photo.name for photo in photos if photo.mask is None]
     if masks is not None and len(lacking) == len(photos):
         raise ValueError(f"{masks}: holds no mask of a photograph, called {lacking[0]}.png for {lacking[0]}")
-    if masks is not None and lacking:
-        message = f"{masks}: {len(lacking)} of {len(photos)} photographs have no mask, such as {lacking[0]}"
-        warnings.warn(f"{message}: all of their pixels count", stacklevel=3)
+    if masks is not None:
+        warn_of_lacking_masks(masks, lacking, len(photos))
     grey: list[Path] = []
     groups = _stage_flat([photo for photo in photos if photo.kind == "photograph"], folder, grey)
     tops = {name.partition("/")[0] for group in groups for name in group.names}
@@ -185,10 +185,10 @@ def _decided(photos: Sequence[_Photo], videos: Container[int]) -> list[_Photo]:
     decided = []
     unclear = []
     for photo in photos:
-        own = votes[photo.source, photo.facts.size]
         kind = photo.kind
         if kind == "unclear" or photo.source in videos:
-            kind = "panorama" if own["panorama"] > own["photograph"] else "photograph"
+            alike = votes[photo.source, photo.facts.size]
+            kind = "panorama" if alike["panorama"] > alike["photograph"] else "photograph"
         if photo.kind == "unclear" and kind == "photograph":
             unclear.append(photo.name)
         decided.append(photo._replace(kind=kind))
@@ -306,18 +306,18 @@ def _stage_panoramas(
     rigs = []
     tops = _made_unique([f"panorama{number or ''}" for number in range(len(by_size))], tops)
     for top, (size, members) in zip(tops, by_size.items(), strict=True):
-        # The first suffix is added if the name has none of them.
-        suffixes = [(".png",) if photo.facts.is_transparent else (".jpg", ".jpeg") for photo in members]
-        views = _made_unique(
-            [
-                photo.name if photo.name.lower().endswith(own) else photo.name + own[0]
-                for photo, own in zip(members, suffixes, strict=True)
-            ]
-        )
+        wanted = []
+        for photo in members:
+            suffixes = (".png",) if photo.facts.is_transparent else (".jpg", ".jpeg")
+            wanted.append(photo.name if photo.name.lower().endswith(suffixes) else photo.name + suffixes[0])
+        views = _made_unique(wanted)
         map_in_threads(cut, members, itertools.repeat(top), views)
         side, focal = view_size(size[0])
-        names = [tuple(f"{top}/{direction.name}/{view}" for view in sorted(views)) for direction in directions()]
-        rigs.append(Rig(top, tuple(CameraGroup(own, (side, side), focal) for own in names)))
+        groups = []
+        for direction in directions():
+            names = tuple(f"{top}/{direction.name}/{view}" for view in sorted(views))
+            groups.append(CameraGroup(names, (side, side), focal))
+        rigs.append(Rig(top, tuple(groups)))
         tell(
             f"{counted(len(members), 'panorama')} of {size[0]}x{size[1]}, each cut into {len(directions())} views of "
             f"{side}x{side}; panorama='no' leaves them whole"
@@ -337,10 +337,12 @@ def directions() -> tuple[Direction, ...]:
     """Return the views that a panorama is cut into, the one towards its middle first."""
     headings = [360.0 * number / AROUND for number in range(AROUND)]
     angles = [(f"heading{heading:03.0f}", heading, 0.0) for heading in headings]
-    angles += [("up", 0.0, 90.0), ("down", 0.0, -90.0)]
-    # A view is turned right by its heading and then up by its pitch.
-    turns = [Rotation.from_euler("YX", [heading, pitch], degrees=True) for _, heading, pitch in angles]
-    return tuple(Direction(name, turn.as_matrix().T) for (name, _, _), turn in zip(angles, turns, strict=True))
+    found = []
+    for name, heading, pitch in (*angles, ("up", 0.0, 90.0), ("down", 0.0, -90.0)):
+        # A view is turned right by its heading and then up by its pitch.
+        turn = Rotation.from_euler("YX", [heading, pitch], degrees=True)
+        found.append(Direction(name, turn.as_matrix().T))
+    return tuple(found)
 
 
 def view_size(width: int) -> tuple[int, float]:
@@ -352,24 +354,17 @@ def view_size(width: int) -> tuple[int, float]:
 
 def cut_view(panorama: np.ndarray, direction: Direction) -> np.ndarray:
     """Return the square view [side, side, C] uint8 of a panorama [H, W, C] in a direction, sampled bilinearly."""
-    height, width, channels = panorama.shape
+    height, width = panorama.shape[:2]
     side, focal = view_size(width)
     wrapped = np.concatenate([panorama[:, -1:], panorama, panorama[:, :1]], axis=1)  # Columns continue over the seam.
-    view = np.empty((side, side, channels), np.uint8)
-    for top in range(0, side, ROWS_AT_ONCE):
-        rows = view[top : top + ROWS_AT_ONCE]
-        x, y = np.meshgrid(np.arange(side) + 0.5 - side / 2, np.arange(top, top + len(rows)) + 0.5 - side / 2)
+
+    def places(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         # Rows times R are Rᵀ times columns: from the view to the panorama.
-        rays = np.stack([x, y, np.full_like(x, focal)], -1) @ direction.rotation
+        rays = np.stack([x - side / 2, y - side / 2, np.full_like(x, focal)], -1) @ direction.rotation
         longitude = np.arctan2(rays[..., 0], rays[..., 2])
         latitude = np.arctan2(-rays[..., 1], np.hypot(rays[..., 0], rays[..., 2]))
-        row, column = (0.5 - latitude / np.pi) * height, (0.5 + longitude / (2 * np.pi)) * width
-        places = np.stack([row - 0.5, column - 0.5 + 1])  # One more for the wrapped column on the left.
-        for channel in range(channels):
-            rows[..., channel] = np.rint(map_coordinates(wrapped[..., channel], places, np.float32, 1, mode="nearest"))
-    return view
+        row = (0.5 - latitude / np.pi) * height
+        column = (0.5 + longitude / (2 * np.pi)) * width
+        return np.stack([row - 0.5, column - 0.5 + 1])  # One more for the wrapped column on the left.
 
-
-def is_panorama(pixels: np.ndarray) -> bool:
-    """Return whether a picture [H, W, C] uint8 is recognised as a whole panorama, twice as wide as high."""
-    return pixels.shape[1] == 2 * pixels.shape[0] and projection_of(pixels) == "panorama"
+    return np.rint(sampled(wrapped, (side, side), places)).astype(np.uint8)

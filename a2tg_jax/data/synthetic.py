@@ -168,7 +168,8 @@ def still_life(rng: np.random.Generator) -> list[tuple[ParametricSurface, np.nda
     text = patterns.text_mask(motto, 64, 2560, 50, repeat=True)
     wall[142:206] = patterns.mix(patterns.SLATE, patterns.CREAM, text)
     rim = patterns.checks(2, 120, patterns.INK, patterns.GOLD, texels=16)
-    letters, colors = "A2TGA", (patterns.CORAL, patterns.TEAL, patterns.LEAF, patterns.SKY, patterns.GOLD)
+    letters = "A2TGA"
+    colors = (patterns.CORAL, patterns.TEAL, patterns.LEAF, patterns.SKY, patterns.GOLD)
     return [
         (Tube((0, 0, 0), 3.0, 2.4, is_inward=True), wall),
         (Disc((0, 0, 0), 3.0), patterns.planks(rng, 896, 26, 190)),
@@ -266,17 +267,20 @@ def render(surfaces: Sequence[Surface], viewmat: np.ndarray, K: np.ndarray, widt
 
 def sample_points(surfaces: Sequence[Surface], shots: list[Shot], count: int, rng: np.random.Generator) -> PointCloud:
     """Return surface points under `count` random pixels of the shots, with the colours of those pixels."""
-    points, colors, missing = [], [], count
+    points = []
+    colors = []
+    missing = count
     while missing:
         shares = np.bincount(rng.integers(len(shots), size=missing), minlength=len(shots))
         for shot, share in zip(shots, shares, strict=True):
             pixels = shot.picture.read()
             height, width = shot.picture.size
-            column, row = rng.integers(width, size=share), rng.integers(height, size=share)
+            column = rng.integers(width, size=share)
+            row = rng.integers(height, size=share)
             directions = _directions(shot.viewmat, shot.K, column + 0.5, row + 0.5)
-            found = trace_rays(surfaces, _center(shot.viewmat), directions)[1].T
-            is_hit = np.isfinite(found).all(axis=1)  # Instead of pixels of the background, others are drawn.
-            points.append(found[is_hit])
+            places = trace_rays(surfaces, _center(shot.viewmat), directions)[1].T
+            is_hit = np.isfinite(places).all(axis=1)  # Instead of pixels of the background, others are drawn.
+            points.append(places[is_hit])
             colors.append(pixels[row, column][is_hit])
             missing -= int(np.count_nonzero(is_hit))
     return PointCloud(np.concatenate(points), np.concatenate(colors))
@@ -288,7 +292,8 @@ def exact_points(scene: Scene) -> np.ndarray:
     """
     # Only colours depend on the seed.
     shapes = [shape for shape, _ in ARRANGEMENTS[scene.name].surfaces(np.random.default_rng(0))]
-    inverse, points = scene.transform.inverse(), []
+    inverse = scene.transform.inverse()
+    points = []
     for camera in (view.camera for view in scene.train):
         viewmat = inverse.apply_to_viewmat(np.asarray(camera.viewmat, np.float64))
         x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)

@@ -8,9 +8,10 @@ both are in the file's own world, which is the original world here. Points of it
 """
 
 import functools
+import itertools
 import os
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -52,6 +53,15 @@ class Frames(NamedTuple):
     counted: Counted | None = None
 
 
+class Cameras(NamedTuple):
+    """Cameras of another program that were found in a folder."""
+
+    file: Path
+    """Their file or folder, which tells them from others next to them."""
+    read: Callable[[], Frames]
+    """Function that reads them."""
+
+
 def load_transforms(file: Path, options: Options) -> Scene:
     """Read a nerfstudio or instant-ngp scene.
 
@@ -59,25 +69,36 @@ def load_transforms(file: Path, options: Options) -> Scene:
     split without a test list); otherwise test_every does. A warning counts frames that the lists leave out.
     """
     meta = _read_meta(file)
-    (shots,) = _read_shots([(file, meta)], options)
-    train, test = every_kth(shots, options.test_every)
-    if listed := {key: set(meta[key]) for key in SPLIT_KEYS if key in meta}:
-        names = {shot.name for shot in shots}
-        for key, own in listed.items():
-            if unknown := sorted(own - names):
-                raise ValueError(
-                    f"{file}: {key} names {shortened(unknown[0])}, which is no frame; write names as file_path has "
-                    f"them, such as {shots[0].name}"
-                )
-        test_names = listed.get("test_filenames") or listed.get("val_filenames") or set()
-        train_names = listed.get("train_filenames", names) - test_names
-        if unused := sorted(names - train_names - test_names):
-            only = "; val_filenames count only without test_filenames" if listed.get("val_filenames") else ""
-            message = f"{len(unused)} of {len(names)} frames are in no list that is used, such as {unused[0]}{only}"
-            warnings.warn(f"{file}: {message}", stacklevel=3)
-        train, test = ([shot for shot in shots if shot.name in chosen] for chosen in (train_names, test_names))
+    (shots,) = _read_shots({file: meta}, options)
+    lists = {key: set(meta[key]) for key in SPLIT_KEYS if key in meta}
+    if lists:
+        train, test = _split_by_lists(file, shots, lists)
+    else:
+        train, test = every_kth(shots, options.test_every)
     cloud = _points_beside(file, [meta], shots)
     return assemble_scene(scene_name(file.resolve().parent), train, test, cloud, source=str(file))
+
+
+def _split_by_lists(file: Path, shots: Sequence[Shot], lists: dict[str, set[str]]) -> tuple[list[Shot], list[Shot]]:
+    """Return the shots to train and to test on, as the lists of names in a transforms file say."""
+    names = {shot.name for shot in shots}
+    for key, listed in lists.items():
+        unknown = sorted(listed - names)
+        if unknown:
+            raise ValueError(
+                f"{file}: {key} names {shortened(unknown[0])}, which is no frame; write names as file_path has "
+                f"them, such as {shots[0].name}"
+            )
+    val_names = lists.get("val_filenames", set())
+    test_names = lists.get("test_filenames") or val_names
+    train_names = lists.get("train_filenames", names) - test_names
+    unused = sorted(names - train_names - test_names)
+    if unused:
+        only = "; val_filenames count only without test_filenames" if val_names else ""
+        message = f"{len(unused)} of {len(names)} frames are in no list that is used, such as {unused[0]}{only}"
+        warnings.warn(f"{file}: {message}", stacklevel=4)
+    train = [shot for shot in shots if shot.name in train_names]
+    return train, [shot for shot in shots if shot.name in test_names]
 
 
 def load_blender(folder: Path, options: Options) -> Scene:
@@ -89,38 +110,34 @@ def load_blender(folder: Path, options: Options) -> Scene:
     train_file, test_file = (folder / name for name in BLENDER_FILES)
     warn_of_others(train_file, transforms_in(folder))
     files = [train_file, test_file] if is_regular(test_file) else [train_file]
-    metas = [_read_meta(file) for file in files]
-    groups = _read_shots(list(zip(files, metas, strict=True)), options)
-    train, test = groups if len(groups) == 2 else every_kth(groups[0], options.test_every)
-    cloud = _points_beside(train_file, metas, groups[0])
+    metas = {file: _read_meta(file) for file in files}
+    train, *test_files = _read_shots(metas, options)
+    cloud = _points_beside(train_file, list(metas.values()), train)
+    if test_files:
+        test = test_files[0]
+    else:
+        train, test = every_kth(train, options.test_every)
     return assemble_scene(scene_name(folder), train, test, cloud, source=str(folder), is_object=True)
 
 
-def load_frames(made: Frames, options: Options) -> Scene:
-    """Make a scene of frames of another program."""
-    (shots,) = _read_shots([(made.file, {"frames": made.frames})], options, made.counted)
-    name = scene_name(made.file.resolve().parent)
-    return assemble_scene(name, *every_kth(shots, options.test_every), made.cloud, source=str(made.file))
-
-
-def reading_one(chosen: Path, files: Sequence[Path], read: Callable[[], Frames]) -> Callable[[], Frames]:
-    """Return a function that reads the chosen one of several files of cameras, with a warning that names the others."""
-
-    def read_one() -> Frames:
-        warn_of_others(chosen, files)
-        return read()
-
-    return read_one
+def load_frames(found: Sequence[Cameras], options: Options) -> Scene:
+    """Make a scene of the first of some cameras of another program, with a warning that names the others."""
+    chosen = found[0]
+    warn_of_others(chosen.file, [cameras.file for cameras in found])
+    frames = chosen.read()
+    (shots,) = _read_shots({frames.file: {"frames": frames.frames}}, options, frames.counted)
+    name = scene_name(frames.file.resolve().parent)
+    train, test = every_kth(shots, options.test_every)
+    return assemble_scene(name, train, test, frames.cloud, source=str(frames.file))
 
 
 def warn_of_others(chosen: Path, files: Sequence[Path]) -> None:
     """Warn of further files of cameras than the one that is read, such as a second export next to it."""
-    others = [file for file in files if file != chosen]
+    others = [os.path.relpath(file, chosen.parent) for file in files if file != chosen]
     if others:
-        names = first_names([os.path.relpath(file, chosen.parent) for file in others])
         warnings.warn(
-            f"{chosen.parent}: {chosen.name} is read, and not {names}; to read another, give that file, or a folder "
-            "without the others",
+            f"{chosen.parent}: {chosen.name} is read, and not {first_names(others)}; to read another, give that file, "
+            "or a folder without the others",
             stacklevel=3,
         )
 
@@ -149,10 +166,10 @@ def check_images(file: Path, frames: Sequence[object], lacking: Sequence[str], n
 def _points_beside(file: Path, metas: Sequence[dict[str, Any]], shots: Sequence[Shot]) -> PointCloud | None:
     """Return the points that transforms files of a folder name, or else those in one of `POINT_FILES`, or else of
     nerfstudio's COLMAP model, or None."""
-    named = [meta["ply_file_path"] for meta in metas if meta.get("ply_file_path")]
-    usual = [name for name in POINT_FILES if is_regular(file.parent / name)]
-    if named or usual:
-        return read_ply_points(file.parent / (*named, *usual)[0])
+    names = [meta["ply_file_path"] for meta in metas if meta.get("ply_file_path")]
+    names += [name for name in POINT_FILES if is_regular(file.parent / name)]
+    if names:
+        return read_ply_points(file.parent / names[0])
     return points_in_world_of(file.parent / "colmap", {shot.name: shot.viewmat for shot in shots})
 
 
@@ -170,10 +187,11 @@ def _read_meta(file: Path) -> dict[str, Any]:
         for key in FILE_KEYS:
             name = values.get(key)
             # All but images may be empty or null, which means none.
-            if ((key == "file_path" and key in values) or name) and not (isinstance(name, str) and name):
+            if not name and (key != "file_path" or key not in values):
+                continue
+            if not name or not isinstance(name, str):
                 raise ValueError(f"{file}: {key} must be the name of a file; got {shortened(name)}")
-            if name:
-                values[key] = inside(file.parent, name)
+            values[key] = inside(file.parent, name)
         for key in SPLIT_KEYS:
             names = values.get(key, [])
             if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
@@ -184,38 +202,57 @@ def _read_meta(file: Path) -> dict[str, Any]:
 
 
 def _read_shots(
-    files: Sequence[tuple[Path, dict[str, Any]]], options: Options, counted: Counted | None = None
+    metas: Mapping[Path, dict[str, Any]], options: Options, counted: Counted | None = None
 ) -> list[list[Shot]]:
     """Return the frames of each transforms file of a scene, downscaled, in the file's order.
 
-    The files come with their contents, as of `_read_meta`. Values of a frame override the file's.
+    The contents of the files are as from `_read_meta`. Values of a frame override the file's.
     """
     photos = []
-    for file, frame in ((file, {**meta, **frame}) for file, meta in files for frame in meta["frames"]):
-        if "file_path" not in frame or "transform_matrix" not in frame:
-            raise ValueError(f"{file}: a frame lacks file_path or transform_matrix")
-        folder, name = file.parent, frame["file_path"]
-        path, images, what = folder / name, folder / "images", f"{file}: {name}"
-        lens: Lens | Callable[[tuple[int, int]], Lens] = functools.partial(_lens, frame, what, options.lens)
-        # Otherwise the lens needs the full image's size, once that is found.
-        if all(frame.get(side) and number_of(frame[side], f"{what}: {side}") for side in "wh"):
-            lens = _lens(frame, what, options.lens, (0, 0))
-        mask, depths = (folder / frame[key] if frame.get(key) else None for key in ("mask_path", "depth_file_path"))
-        below = (images, path.relative_to(images).as_posix()) if path.is_relative_to(images) else None
-        try:
-            pose = np.asarray(frame["transform_matrix"], np.float64)
-        except (TypeError, ValueError, OverflowError):
-            pose = np.empty(0)
-        if pose.shape not in ((3, 4), (4, 4)):
-            found = f"shape {pose.shape}" if pose.size else shortened(frame["transform_matrix"])
-            raise ValueError(f"{what}: its transform_matrix must be 4x4 numbers; got {found}")
-        camera_to_world = np.eye(4)
-        camera_to_world[:3] = pose[:3] * [1.0, -1.0, -1.0, 1.0]  # from OpenGL's camera to OpenCV's
-        viewmat = np.linalg.inv(rigid_motion(camera_to_world, what))
-        photos.append(Photo(name, viewmat, (path.parent, path.name), below, lens, what, mask, depths, counted))
-    place = files[0][0]
+    for file, meta in metas.items():
+        photos += [_photo(file, {**meta, **frame}, options.lens, counted) for frame in meta["frames"]]
+    place = next(iter(metas))
     shots = iter(read_photos(photos, options, place, place.parent, lambda name: f"remove its frame from {place}"))
-    return [[next(shots) for _ in meta["frames"]] for _, meta in files]
+    return [list(itertools.islice(shots, len(meta["frames"]))) for meta in metas.values()]
+
+
+def _photo(file: Path, frame: dict[str, Any], use: LensUse, counted: Counted | None) -> Photo:
+    """Return the photograph of a frame of a transforms file, with its camera."""
+    if "file_path" not in frame or "transform_matrix" not in frame:
+        raise ValueError(f"{file}: a frame lacks file_path or transform_matrix")
+    name = frame["file_path"]
+    what = f"{file}: {name}"
+    # Without a size in the frame, the lens needs the full image's, once that is found.
+    lens: Lens | Callable[[tuple[int, int]], Lens] = functools.partial(_lens, frame, what, use)
+    if all(frame.get(side) and number_of(frame[side], f"{what}: {side}") for side in "wh"):
+        lens = _lens(frame, what, use, (0, 0))
+    path = file.parent / name
+    images = file.parent / "images"
+    return Photo(
+        name,
+        _viewmat(frame["transform_matrix"], what),
+        (path.parent, path.name),
+        (images, path.relative_to(images).as_posix()) if path.is_relative_to(images) else None,
+        lens,
+        what,
+        mask=file.parent / frame["mask_path"] if frame.get("mask_path") else None,
+        depths=file.parent / frame["depth_file_path"] if frame.get("depth_file_path") else None,
+        counted=counted,
+    )
+
+
+def _viewmat(matrix: object, what: str) -> np.ndarray:
+    """Return the world-to-camera matrix [4, 4] (OpenCV) of a transform_matrix."""
+    try:
+        pose = np.asarray(matrix, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        pose = np.empty(0)
+    if pose.shape not in ((3, 4), (4, 4)):
+        got = f"shape {pose.shape}" if pose.size else shortened(matrix)
+        raise ValueError(f"{what}: its transform_matrix must be 4x4 numbers; got {got}")
+    camera_to_world = np.eye(4)
+    camera_to_world[:3] = pose[:3] * [1.0, -1.0, -1.0, 1.0]  # from OpenGL's camera to OpenCV's
+    return np.linalg.inv(rigid_motion(camera_to_world, what))
 
 
 def _lens(frame: dict[str, Any], what: str, use: LensUse, full: tuple[int, int]) -> Lens:
@@ -225,27 +262,28 @@ def _lens(frame: dict[str, Any], what: str, use: LensUse, full: tuple[int, int])
         return number_of(frame.get(key, default), f"{what}: {key}")
 
     def side(key: str, default: int) -> int:
-        side = (number(key, default) if frame.get(key) else 0) or default  # 0 and null mean the image's.
-        if not 1 <= side <= LONGEST_SIDE:  # False for NaN.
-            raise ValueError(f"{what}: {key} must be in 1..{LONGEST_SIDE} pixels; got {side:g}")
-        return int(side)
+        given = number(key, default) if frame.get(key) else 0
+        length = given or default  # 0 and null mean the image's.
+        if not 1 <= length <= LONGEST_SIDE:  # False for NaN.
+            raise ValueError(f"{what}: {key} must be in 1..{LONGEST_SIDE} pixels; got {length:g}")
+        return int(length)
 
-    width, height = side("w", full[0]), side("h", full[1])
-    lengths = {}
+    width = side("w", full[0])
+    height = side("h", full[1])
+    focal = {}
     for axis, size in (("x", width), ("y", height)):
         if f"fl_{axis}" in frame:
-            lengths[axis] = number(f"fl_{axis}", 0.0)
+            focal[axis] = number(f"fl_{axis}", 0.0)
         elif f"camera_angle_{axis}" in frame:
             angle = number(f"camera_angle_{axis}", 0.0)
-            lengths[axis] = size / (2 * np.tan(angle / 2)) if 0 < angle < np.pi else 0.0
-    if not lengths or not min(lengths.values()) > 0:
+            focal[axis] = size / (2 * np.tan(angle / 2)) if 0 < angle < np.pi else 0.0
+    if not focal or not min(focal.values()) > 0:
         raise ValueError(f"{what}: has no focal length; give fl_x above 0, or camera_angle_x between 0 and pi")
-    fx, fy = lengths.get("x", lengths.get("y", 0.0)), lengths.get("y", lengths.get("x", 0.0))
     # nerfstudio's parameters of distortion have COLMAP's names and meaning.
     is_fisheye = str(frame.get("is_fisheye")).lower() in ("true", "1")  # It may be a text.
     model = "OPENCV_FISHEYE" if is_fisheye else frame.get("camera_model", "OPENCV")
     terms = {key: number(key, 0.0) for key in PRISM_KEYS}
-    if model in ("OPENCV_FISHEYE", "THIN_PRISM_FISHEYE"):
+    if model in tuple(DISTORTION_KEYS):  # A model may be no text, and then no key.
         distortion = [terms[key] for key in DISTORTION_KEYS[model]]
     elif model not in PERSPECTIVE_MODELS:
         wanted = "a perspective one, OPENCV_FISHEYE or THIN_PRISM_FISHEYE"
@@ -253,7 +291,10 @@ def _lens(frame: dict[str, Any], what: str, use: LensUse, full: tuple[int, int])
     elif terms["k4"] != 0:
         raise ValueError(f"{what}: has k4 with a perspective camera; only k1, k2, k3, p1 and p2 are read there")
     else:
-        # k4 to k6 of FULL_OPENCV are in a denominator, which is 1 with zeros.
-        model, distortion = "FULL_OPENCV", [*(terms[key] for key in PRISM_KEYS[:5]), 0.0, 0.0, 0.0]
+        model = "FULL_OPENCV"
+        # Its k4 to k6 are in a denominator, which is 1 with zeros.
+        distortion = [*(terms[key] for key in PRISM_KEYS[:5]), 0.0, 0.0, 0.0]
+    fx = focal.get("x") or focal["y"]
+    fy = focal.get("y") or fx
     params = (fx, fy, number("cx", width / 2), number("cy", height / 2), *distortion)
     return checked_lens(ColmapCamera(model, width, height, params), what, use)

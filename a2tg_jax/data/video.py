@@ -21,7 +21,8 @@ from a2tg_jax.host.regular_files import open_regular
 from a2tg_jax.host.text import as_argument
 
 DEFAULT_FRAMES = 150
-SHARPNESS_WIDTH, MOTION_WIDTH = 640, 128
+SHARPNESS_WIDTH = 640
+MOTION_WIDTH = 128
 """Widths in pixels of the greyscale frames on which sharpness and motion are measured."""
 LEAST_MOTION = 0.005
 """Motion between two frames, as a share of the width, below which the camera counts as still."""
@@ -49,8 +50,10 @@ def extract_frames(video: Path, folder: Path, count: int, *, progress: bool = Tr
       (number written, number of frames of the video).
     """
     stream, size = _chosen_stream(video)
-    sharpness, places = [], []
-    seen, path = None, 0.0
+    sharpness = []
+    places = []
+    path = 0.0
+    seen = None  # The last frame that moved, so that slow motion adds up.
     is_interlaced = False
     for frame in _frames(video, stream, "scoring frames", progress):
         is_interlaced |= bool(frame.interlaced_frame)
@@ -58,9 +61,9 @@ def extract_frames(video: Path, folder: Path, count: int, *, progress: bool = Tr
         sharpness.append(float(laplace(_grey(frame, SHARPNESS_WIDTH).astype(np.float32)).var()))
         small = _grey(frame, MOTION_WIDTH)
         moved = LEAST_MOTION if seen is None else motion(seen, small)
-        # `seen` is the last frame that moved, so that slow motion adds up.
         if moved >= LEAST_MOTION:
-            seen, path = small, path + moved
+            seen = small
+            path += moved
         places.append(path)
     if not places:
         raise ValueError(f"{video}: has no frames that can be decoded; {_conversion(video)}")
@@ -104,7 +107,8 @@ def motion(before: np.ndarray, after: np.ndarray) -> float:
     The change of brightness over time divided by its change over space is the speed along the gradient. Beyond a few
     pixels it saturates, at a value that is large enough.
     """
-    before, after = before.astype(np.float32), after.astype(np.float32)
+    before = before.astype(np.float32)
+    after = after.astype(np.float32)
     slope = sum(float(np.abs(part).mean()) for part in np.gradient(before))
     # Blank frames have no slope.
     return float(np.abs(after - before).mean() / max(slope, 1.0) / before.shape[1])
@@ -147,9 +151,9 @@ def _chosen_stream(video: Path) -> tuple[int, tuple[int, int]]:
             raise ValueError(f"{video}: has no video stream that can be decoded; {_conversion(video)}")
         chosen = max(streams, key=lambda stream: int(stream.width * stream.height))
         if len(streams) > 1:
-            found = ", ".join(f"{stream.index} ({stream.width}x{stream.height})" for stream in streams)
+            names = ", ".join(f"{stream.index} ({stream.width}x{stream.height})" for stream in streams)
             warnings.warn(
-                f"{video}: has the video streams {found}; {chosen.index} is read. To write another: "
+                f"{video}: has the video streams {names}; {chosen.index} is read. To write another: "
                 f"ffmpeg -i {as_argument(video)} -map 0:NUMBER -c copy other.mp4",
                 stacklevel=3,
             )
@@ -194,5 +198,6 @@ def _display_matrix(frame: Any) -> np.ndarray:
 def _as_shown(pixels: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     """Return pixels [H, W, C] turned and mirrored by the display matrix, rounded to quarter turns."""
     if abs(matrix[0, 1]) + abs(matrix[1, 0]) > abs(matrix[0, 0]) + abs(matrix[1, 1]):
-        pixels, matrix = pixels.swapaxes(0, 1), matrix[:, ::-1]
+        pixels = pixels.swapaxes(0, 1)
+        matrix = matrix[:, ::-1]
     return pixels[:: -1 if matrix[1, 1] < 0 else 1, :: -1 if matrix[0, 0] < 0 else 1]

@@ -50,8 +50,10 @@ MOST_GROWTH = 2.0
 ITERATIONS = 500
 MOST_VIEWS = 12
 """Largest number of views, evenly chosen, for measuring where texels and spherical harmonics matter."""
-LEAST_ALPHA, MOST_ALPHA = 1 / 255, 0.99
-"""Limits of a splat's alpha: fainter splats are dropped, others clipped."""
+LEAST_ALPHA = 1 / 255
+"""Smallest alpha of a splat; fainter splats are dropped."""
+MOST_ALPHA = 0.99
+"""Largest alpha of a splat; larger ones are clipped."""
 SAME_PSNR = 38.0
 """PSNR in dB against the full model above which higher degrees of spherical harmonics are dropped."""
 
@@ -109,19 +111,22 @@ def split_splats(model: Model, cameras: Sequence[Camera], growth: float) -> Mode
     weights = texel_weights(model, cameras, model.background)
     tables = fewest_texels(model.appearance.texture.shown(), weights, most)
     whole = dataclasses.replace(model.gaussians, sh=jnp.asarray(model.sh[:, : NUM_BASES[degree]]))
-    pieces, shapes = [], model.appearance.shapes
+    pieces = []
     for ids, texels in tables:
-        parents, own, size = whole[ids], None if shapes is None else np.asarray(shapes)[ids], texels.shape[1:3]
+        parents = whole[ids]
+        size = texels.shape[1:3]
+        shapes = None if model.appearance.shapes is None else np.asarray(model.appearance.shapes)[ids]
         # A single splat cannot imitate a kernel by a grid: it takes the nearest Gaussian.
-        if own is not None and size == (1, 1):
-            parents, own = nearest_gaussians(parents, own), None
+        if shapes is not None and size == (1, 1):
+            parents = nearest_gaussians(parents, shapes)
+            shapes = None
         axes = [kernels(side, options) for side in size]
         at_centers = [_weights(means, side, options) for (means, _), side in zip(axes, size, strict=True)]
         shown = np.einsum("ntsc,tv,su->nvuc", texels, *at_centers)
         if options.outside == "identity":
             shares_v, shares_u = (shares_inside(side, options) for side in size)
             shown = np.asarray(NEUTRAL_TEXEL) + (shares_v[:, None] * shares_u)[..., None] * (shown - NEUTRAL_TEXEL)
-        pieces.append(_grid(parents, own, shown, *axes))
+        pieces.append(_grid(parents, shapes, shown, *axes))
     joined: Gaussians = jax.tree.map(lambda *parts: jnp.concatenate(parts), *pieces)
     # Fainter splats are skipped by every renderer, and would only take bytes.
     is_seen = np.asarray(joined.opacities) >= LEAST_ALPHA
@@ -184,8 +189,8 @@ def _grid(parents: Gaussians, shapes: np.ndarray | None, texels: np.ndarray, v: 
     """Return n·Tv·Tu Gaussians for n that show textures [n, Tv, Tu, 4] at their centres."""
     tv, tu = texels.shape[1:3]
     places, scales = (
-        np.stack(np.broadcast_arrays(own_u[None, :], own_v[:, None]), -1).reshape(-1, 2)
-        for own_u, own_v in zip(u, v, strict=True)
+        np.stack(np.broadcast_arrays(along_u[None, :], along_v[:, None]), -1).reshape(-1, 2)
+        for along_u, along_v in zip(u, v, strict=True)
     )
     rho = v[0][:, None] ** 2 + u[0][None, :] ** 2
     if shapes is None:
@@ -201,9 +206,9 @@ def _grid(parents: Gaussians, shapes: np.ndarray | None, texels: np.ndarray, v: 
         for means, widths in (v, u)
     ]
     # The shares are products over the two axes, so that two small inverses suffice.
-    own = np.einsum("vw,nwx,xu->nvu", unmixed[0], depths, unmixed[1].T)
+    unmixed_depths = np.einsum("vw,nwx,xu->nvu", unmixed[0], depths, unmixed[1].T)
     # The inverse may give negative depths next to opaque texels.
-    alphas = np.clip(1 - np.exp(-np.maximum(own, 0)), 1e-6, MOST_ALPHA).reshape(-1)
+    alphas = np.clip(1 - np.exp(-np.maximum(unmixed_depths, 0)), 1e-6, MOST_ALPHA).reshape(-1)
     axes = np.asarray(rotation_matrices(parents.quats))[:, :, :2] * np.asarray(parents.scales)[:, None, :]
     means = np.asarray(parents.means)[:, None] + np.einsum("nxk,pk->npx", axes, places)
     several = functools.partial(np.repeat, repeats=tv * tu, axis=0)
@@ -236,7 +241,8 @@ def distill(
     behind: Background = "white" if np.mean(wanted.background) > 0.5 else "black"
     # Only the second stage runs: it does not change the number of Gaussians.
     system = Gaussians2d(stage1_iterations=1, stage2_iterations=iterations, sh_degree=highest, background=behind)
-    scene, start = drawn_scene(wanted, cameras, BACKGROUNDS[behind]), dataclasses.replace(model, origin=None)
+    scene = drawn_scene(wanted, cameras, BACKGROUNDS[behind])
+    start = dataclasses.replace(model, origin=None)
     trained = fit_stage(scene, system, 1, start, progress=progress, title="bake").model
     return dataclasses.replace(trained, origin=wanted.origin)
 
@@ -260,7 +266,7 @@ def pictures(model: Model, cameras: Sequence[Camera], background: Color | None =
         yield np.clip(np.asarray(renderer(camera).color), 0, 1)
 
 
-def likeness(found: Iterable[np.ndarray], wanted: Iterable[np.ndarray]) -> float:
+def likeness(images: Iterable[np.ndarray], wanted: Iterable[np.ndarray]) -> float:
     """Return the PSNR in dB between pictures, from the mean of their squared errors; at most 100."""
-    error = np.mean([np.mean((x - y) ** 2) for x, y in zip(found, wanted, strict=True)])
+    error = np.mean([np.mean((x - y) ** 2) for x, y in zip(images, wanted, strict=True)])
     return -10 * math.log10(max(float(error), 1e-10))

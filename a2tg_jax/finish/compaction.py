@@ -1,7 +1,7 @@
-"""Smallest file of a model within a loss, or the best one within some bytes, from what each choice of bits costs.
+"""Precisions for a compact file: the smallest file within a loss, or the file of a given size that loses least.
 
-A loss is a function of a model: how many dB it is below the original model. It is measured on photographs or, without
-them, estimated from differences between renders.
+A loss is a function of a model that returns how many dB it is below the original model. It is measured on photographs
+or, without them, estimated from differences between renders.
 """
 
 import bisect
@@ -103,8 +103,8 @@ def loss_on_views(
             decibels.append(-10 * math.log10(max(error, 1e-12)))
         return float(np.mean(decibels))
 
-    own = psnr(model)
-    return lambda other: own - psnr(other)
+    psnr_of_model = psnr(model)
+    return lambda other: psnr_of_model - psnr(other)
 
 
 def loss_beside_renders(
@@ -166,10 +166,14 @@ def _squared_error(image: np.ndarray, target: np.ndarray) -> float:
 
 def try_choices(model: Model, choices: CompactChoices, losses: Sequence[Loss], group: str = "") -> Trial:
     """Return the size of a file, and the loss of the model in it by each measure (host)."""
+    return trial_of(encode_model(model, choices), choices, losses, group)
+
+
+def trial_of(data: bytes, choices: CompactChoices, losses: Sequence[Loss], group: str = "") -> Trial:
+    """Return the size of a file, given as bytes, and the loss of the model in it by each measure (host)."""
     # Measured on what the file gives back, not on a simulation of it.
-    data = encode_model(model, choices)
-    again = decode_model(data)
-    return Trial(choices, len(data), tuple(loss(again) for loss in losses), group)
+    model = decode_model(data)
+    return Trial(choices, len(data), tuple(loss(model) for loss in losses), group)
 
 
 def finest_choices(ladder: Ladder = LADDER) -> CompactChoices:
@@ -227,28 +231,30 @@ def smallest_within(model: Model, losses: Sequence[Loss], max_loss: float, trial
       ValueError: if the finest choices lose more.
     """
     by_size = _by_size(trials)
-    finest = {group: own[-1].precision for group, own in by_size.items()}
+    finest = {group: steps[-1].precision for group, steps in by_size.items()}
     # The sum of separate losses is only an estimate: coarser groups may interact.
     for chosen in [*reversed(_descent(by_size, max_loss)), finest]:
-        found = try_choices(model, finest_choices().keeping(chosen), losses)
-        if found.losses[0] <= max_loss:
+        best = try_choices(model, finest_choices().keeping(chosen), losses)
+        if best.losses[0] <= max_loss:
             break
     else:
-        least = f"{found.losses[0]:.4f} dB or more"
+        least = f"{best.losses[0]:.4f} dB or more"
         raise TooMuchLostError(f"max_loss must be {least}: the finest choices lose that; got {max_loss}")
 
     def next_step(group: str) -> tuple[int, Precision]:
         """Return the bytes that a group's next smaller step saves, and its precision; 0 if there is none."""
-        own = by_size[group]
-        at = [trial.precision for trial in own].index(getattr(found.choices, group))
-        return own[at].num_bytes - own[max(at - 1, 0)].num_bytes, own[max(at - 1, 0)].precision
+        steps = by_size[group]
+        at = [trial.precision for trial in steps].index(getattr(best.choices, group))
+        smaller = steps[max(at - 1, 0)]
+        return steps[at].num_bytes - smaller.num_bytes, smaller.precision
 
     for group in sorted(by_size, key=lambda group: -next_step(group)[0]):  # Largest savings first.
         saved, precision = next_step(group)
         if saved:
-            tried = try_choices(model, found.choices.keeping({group: precision}), losses)
-            found = tried if tried.losses[0] <= max_loss and tried.num_bytes < found.num_bytes else found
-    return found
+            tried = try_choices(model, best.choices.keeping({group: precision}), losses)
+            if tried.losses[0] <= max_loss and tried.num_bytes < best.num_bytes:
+                best = tried
+    return best
 
 
 class TooLargeError(ValueError):
@@ -263,7 +269,8 @@ class TooLargeError(ValueError):
 def check_fits(model: Model, max_bytes: int, ladder: Ladder = LADDER) -> None:
     """Raise TooLargeError if the file with the coarsest steps of all groups takes more bytes (host)."""
     coarsest = CompactChoices().keeping({group: steps[0] for group, steps in ladder.items()})
-    if (least := len(encode_model(model, coarsest))) > max_bytes:
+    least = len(encode_model(model, coarsest))
+    if least > max_bytes:
         raise TooLargeError(least)
 
 
@@ -286,24 +293,25 @@ def best_within(model: Model, max_bytes: int, trials: Sequence[Trial]) -> Compac
     def size_of(kept: Mapping[str, Precision]) -> int:
         return len(encode_model(model, finest_choices().keeping(kept)))
 
-    path = [{group: own[-1].precision for group, own in by_size.items()}, *_descent(by_size, math.inf)]
+    path = [{group: steps[-1].precision for group, steps in by_size.items()}, *_descent(by_size, math.inf)]
     at = bisect.bisect_left(range(len(path)), True, key=lambda index: size_of(path[index]) <= max_bytes)
     if at == len(path):
         raise TooLargeError(size_of(path[-1]))
     chosen = path[at]
     while True:
-        steps = [
-            (finer.losses[0] - coarser.losses[0], finer)
-            for own in by_size.values()
-            for coarser, finer in itertools.pairwise(own)
-            if coarser.precision == chosen[coarser.group]
-        ]
-        gaining = [finer for change, finer in sorted(steps, key=lambda step: step[0]) if change < 0]
-        tried = (chosen | {finer.group: finer.precision} for finer in gaining)
-        better = next((kept for kept in tried if size_of(kept) <= max_bytes), None)
-        if better is None:
+        gains: list[tuple[float, Trial]] = []
+        for steps in by_size.values():
+            for coarser, finer in itertools.pairwise(steps):
+                gain = coarser.losses[0] - finer.losses[0]
+                if coarser.precision == chosen[coarser.group] and gain > 0:
+                    gains.append((gain, finer))
+        for _, finer in sorted(gains, key=lambda pair: -pair[0]):
+            tried = chosen | {finer.group: finer.precision}
+            if size_of(tried) <= max_bytes:
+                chosen = tried
+                break
+        else:
             return finest_choices().keeping(chosen)
-        chosen = better
 
 
 def _by_size(trials: Sequence[Trial]) -> dict[str, list[Trial]]:
@@ -311,26 +319,30 @@ def _by_size(trials: Sequence[Trial]) -> dict[str, list[Trial]]:
     by_group: dict[str, list[Trial]] = {}
     for trial in trials:
         by_group.setdefault(trial.group, []).append(trial)
-    return {group: sorted(own, key=lambda trial: trial.num_bytes) for group, own in by_group.items()}
+    return {group: sorted(alike, key=lambda trial: trial.num_bytes) for group, alike in by_group.items()}
 
 
 def _descent(by_group: Mapping[str, Sequence[Trial]], max_loss: float) -> list[dict[str, Precision]]:
     """Return the precisions after each step down, given the groups' trials from small to large."""
-    at = {group: own[-1] for group, own in by_group.items()}
+    at = {group: trials[-1] for group, trials in by_group.items()}
     path: list[dict[str, Precision]] = []
+
+    def lost_by(trial: Trial) -> float:
+        # Negative losses are noise, and must not pay for others.
+        return max(trial.losses[0], 0.0)
+
     # Greedy, as for a knapsack: bytes saved per loss. A step may skip precisions that save little.
     while True:
-        # Negative losses are noise, and must not pay for others.
-        predicted = sum(max(trial.losses[0], 0.0) for trial in at.values())
-        steps = [
-            ((at[group].num_bytes - trial.num_bytes) / max(lost, LEAST_LOSS), group, trial)
-            for group, own in by_group.items()
-            for trial in own
-            if trial.num_bytes < at[group].num_bytes
-            and predicted + (lost := max(trial.losses[0], 0.0) - max(at[group].losses[0], 0.0)) <= max_loss
-        ]
-        if not steps:
+        predicted = sum(map(lost_by, at.values()))
+        most_saved = 0.0
+        for group, trials in by_group.items():
+            for trial in trials:
+                lost = lost_by(trial) - lost_by(at[group])
+                saved = (at[group].num_bytes - trial.num_bytes) / max(lost, LEAST_LOSS)
+                if saved > most_saved and predicted + lost <= max_loss:
+                    most_saved = saved
+                    best = trial
+        if not most_saved:
             return path
-        _, group, trial = max(steps, key=lambda step: step[0])
-        at[group] = trial
+        at[best.group] = best
         path.append({group: trial.precision for group, trial in at.items()})

@@ -74,7 +74,7 @@ def polish(
     # Planned once: colours do not change which splats a tile lists.
     settings = plan_render(model, [view.camera for view in views])
     # Views of one size and lens share a program.
-    groups = [stack_views(own).of(None, dtype) for own in views_by_kind(views)]
+    groups = [stack_views(alike).of(None, dtype) for alike in views_by_kind(views)]
     changes = jax.jit(_solve, static_argnums=(3, 4))(model, groups, background, settings, num_steps, ridge)
     return with_colors(model, jax.tree.map(jnp.add, colors_of(model), changes))
 
@@ -131,18 +131,20 @@ def draw_change(model: Model, change: Colors, camera: Camera, settings: RenderSe
 
 def colors_of(model: Model) -> Colors:
     """Return the colours, in which a picture of the model is linear."""
-    tables = model.appearance.coefficients, model.textures
+    tables = (model.appearance.coefficients, model.textures)
     bands, textures = (() if table is None else table.buckets for table in tables)
     return Colors(model.gaussians.sh, bands, tuple(bucket[..., :3] for bucket in textures))
 
 
 def with_colors(model: Model, colors: Colors) -> Model:
     """Return the model with other colours; alpha textures stay."""
-    gaussians, appearance = dataclasses.replace(model.gaussians, sh=colors.sh), model.appearance
-    if (table := appearance.coefficients) is not None:
-        appearance = appearance.with_coefficients(dataclasses.replace(table, buckets=colors.bands))
-    if (textures := appearance.textures) is not None:
-        pairs = zip(colors.rgb, textures.buckets, strict=True)
+    appearance = model.appearance
+    if appearance.coefficients is not None:
+        table = dataclasses.replace(appearance.coefficients, buckets=colors.bands)
+        appearance = appearance.with_coefficients(table)
+    if appearance.textures is not None:
+        pairs = zip(colors.rgb, appearance.textures.buckets, strict=True)
         buckets = tuple(jnp.concatenate([rgb, old[..., 3:]], -1) for rgb, old in pairs)
-        appearance = appearance.with_textures(dataclasses.replace(textures, buckets=buckets))
+        appearance = appearance.with_textures(dataclasses.replace(appearance.textures, buckets=buckets))
+    gaussians = dataclasses.replace(model.gaussians, sh=colors.sh)
     return dataclasses.replace(model, gaussians=gaussians, appearance=appearance)

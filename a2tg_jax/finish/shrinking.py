@@ -67,12 +67,15 @@ def shrink_textures(
             f"{in_words(model.appearance)} cannot shrink: only textures with signed RGB and projected alpha can"
         )
     model = model.live
-    background = model.background if background is None else background
-    loss, cameras = loss_on_views(model, views, background=background), [view.camera for view in views]
+    if background is None:
+        background = model.background
+    loss = loss_on_views(model, views, background=background)
+    cameras = [view.camera for view in views]
     while True:
         step = halve_textures(model, texel_weights(model, cameras, background))
-        shrunk = _cheapest(model, step, lambda found: loss(found) <= max_loss)
-        saved, model = model.num_bytes - shrunk.num_bytes, shrunk
+        shrunk = _cheapest(model, step, lambda other: loss(other) <= max_loss)
+        saved = model.num_bytes - shrunk.num_bytes
+        model = shrunk
         if saved < LEAST_SAVED * model.num_bytes:
             return model
 
@@ -98,12 +101,15 @@ def _cheapest(model: Model, step: Step, is_allowed: Callable[[Model], bool]) -> 
     # Textures of odd sides have no step.
     order = order[step.saved[order] > 0]
     # By bisection: what is lost grows with the number of steps.
-    least, most, best = 0, len(order), model
+    least = 0
+    most = len(order)
+    best = model
     while least < most:
         middle = (least + most + 1) // 2
-        found = taken(model, step, np.isin(np.arange(model.num), order[:middle]))
-        if is_allowed(found):
-            least, best = middle, found
+        tried = taken(model, step, np.isin(np.arange(model.num), order[:middle]))
+        if is_allowed(tried):
+            least = middle
+            best = tried
         else:
             most = middle - 1
         # Each trial draws all views: the last few steps are not worth one.
@@ -116,13 +122,15 @@ def halve_textures(model: Model, weights: Textures) -> Step:
     """Return all textures halved along the cheaper even side, and single texels merged, given h of every texel in the
     layout of the model (host)."""
     assert model.textures is not None
-    textures, gaussians = model.textures, model.gaussians
+    textures = model.textures
+    gaussians = model.gaussians
     halved: list[Group] = []
-    cost, single = np.zeros(textures.num), np.tile(np.asarray(NEUTRAL_TEXEL, np.float64), (textures.num, 1))
-    for (ids, texels), (_, own) in zip(textures.groups(), weights.groups(), strict=True):
+    cost = np.zeros(textures.num)
+    single = np.tile(np.asarray(NEUTRAL_TEXEL, np.float64), (textures.num, 1))
+    for (ids, texels), (_, visible) in zip(textures.groups(), weights.groups(), strict=True):
         # The reverse of doubling: odd sides were never doubled.
         axes = [axis for axis in (1, 2) if texels.shape[axis] > 1 and texels.shape[axis] % 2 == 0]
-        for chosen, smaller, _, costs in _halved(ids, texels, own + LEAST_WEIGHT, axes):
+        for chosen, smaller, _, costs in _halved(ids, texels, visible + LEAST_WEIGHT, axes):
             cost[chosen] = costs
             halved.append((chosen, smaller))
         if texels.shape[1:3] == (1, 1):
@@ -176,8 +184,8 @@ def _weights_in_view(
 
     def draw(buckets: tuple[Array, ...]) -> Array:
         shown = model.with_textures(dataclasses.replace(textures, buckets=buckets))
-        drawn = shown.gaussians, camera, shown.appearance, background, settings
-        return render_traced(*drawn, has_geometry=False)[0].color
+        output, _ = render_traced(shown.gaussians, camera, shown.appearance, background, settings, has_geometry=False)
+        return output.color
 
     color, back = jax.vjp(draw, textures.buckets)
     # Hutchinson: for random signs ε, E[(Jᵀε)²] is the sum of J² over the pixels, h.
@@ -196,17 +204,19 @@ def fewest_texels(textures: Textures, weights: Textures, most: int) -> list[Grou
     """
     start: list[Group] = []
     for (ids, texels), (_, squares) in zip(textures.groups(), weights.groups(), strict=True):
-        own = np.tile(np.asarray([*NEUTRAL_TEXEL, LEAST_WEIGHT]), (len(ids), 1, 1, 1))
+        weighted = np.tile(np.asarray([*NEUTRAL_TEXEL, LEAST_WEIGHT]), (len(ids), 1, 1, 1))
         if texels.size:
             # The visibility becomes a fifth channel, which is added up where texels are joined.
             visible = squares.astype(np.float64).sum(axis=-1, keepdims=True) + LEAST_WEIGHT
-            own = np.concatenate([texels.astype(np.float64), visible], axis=-1)
-        start.append((ids, own))
-    start = tables = _merged(start)
+            weighted = np.concatenate([texels.astype(np.float64), visible], axis=-1)
+        start.append((ids, weighted))
+    start = _merged(start)
     # An empty first entry: concatenation needs one even if no texture can be halved.
     steps: list[tuple[np.ndarray, ...]] = [(np.zeros(0, int),) * 4]
-    least, number = np.zeros(textures.num), 0
-    while tables := [table for table in tables if table[1].shape[1:3] != (1, 1)]:
+    least = np.zeros(textures.num)
+    number = 0
+    tables = start
+    while tables:
         smaller: list[Group] = []
         for ids, texels in tables:
             for chosen, halved, cost in _halved_table(ids, texels):
@@ -215,20 +225,22 @@ def fewest_texels(textures: Textures, weights: Textures, most: int) -> list[Grou
                 least[chosen] = np.maximum(least[chosen], cost / saved)
                 smaller.append((chosen, halved))
                 steps.append((chosen, np.full(len(chosen), number), least[chosen], np.full(len(chosen), saved)))
-        tables, number = _merged(smaller), number + 1
+        tables = _merged(smaller)
+        number += 1
     ids, numbers, costs, saved_texels = (np.concatenate(parts) for parts in zip(*steps, strict=True))
     order = np.lexsort((numbers, costs))  # By cost, and steps of one texture in their order.
     excess = sum(texels[..., 0].size for _, texels in start) - most
     # + 1: the step that reaches the excess is included.
     count = int(np.searchsorted(np.cumsum(saved_texels[order]), excess)) + 1 if excess > 0 else 0
     # A texture takes its steps in order, so that their number says which.
-    rounds, tables = np.bincount(ids[order[:count]], minlength=textures.num), start
+    rounds = np.bincount(ids[order[:count]], minlength=textures.num)
+    tables = start
     for index in range(int(rounds.max(initial=0))):
         moved: list[Group] = []
         for ids, texels in tables:
-            is_own = rounds[ids] > index
-            moved.append((ids[~is_own], texels[~is_own]))
-            moved += [(chosen, halved) for chosen, halved, _ in _halved_table(ids[is_own], texels[is_own])]
+            is_halved = rounds[ids] > index
+            moved.append((ids[~is_halved], texels[~is_halved]))
+            moved += [(chosen, halved) for chosen, halved, _ in _halved_table(ids[is_halved], texels[is_halved])]
         tables = _merged(moved)
     return [(ids, texels[..., :4]) for ids, texels in tables]
 
@@ -269,6 +281,7 @@ def _halved(
         choices.append((means, sums, error.sum(axis=(1, 2, 3))))
     costs = np.asarray([cost for *_, cost in choices])
     for place, parts in enumerate(choices):
-        if (is_own := costs.argmin(axis=0) == place).any():
-            means, sums, cost = (part[is_own] for part in parts)
-            yield ids[is_own], means, sums, cost
+        is_cheapest = costs.argmin(axis=0) == place
+        if is_cheapest.any():
+            means, sums, cost = (part[is_cheapest] for part in parts)
+            yield ids[is_cheapest], means, sums, cost

@@ -35,9 +35,10 @@ from a2tg_jax.finish.compaction import (
     Trial,
     best_within,
     smallest_within,
+    trial_of,
 )
 from a2tg_jax.io.columns import LEAST_OPACITY
-from a2tg_jax.io.compact import CompactChoices, Grids, decode_model, encode_model, grids_of, half_turned
+from a2tg_jax.io.compact import CompactChoices, Grids, encode_model, grids_of, half_turned
 from a2tg_jax.io.model_rows import check_encodable
 from a2tg_jax.model import Model
 from a2tg_jax.training import DivergedError, Stage, System, fit_stage
@@ -79,9 +80,10 @@ class Steps(NamedTuple):
         """Return 2^bits steps between two ends, or one if they are equal; centre and spread may precede them."""
         *contraction, low, high = ends
         last = (1 << bits) - 1
+        if high > low:
+            return cls(low, (high - low) / last, last, tuple(contraction))
         # Size 1 instead of 0: it divides.
-        size, last = ((high - low) / last, last) if high > low else (1.0, 0)
-        return cls(low, size, last, tuple(contraction))
+        return cls(low, 1.0, 0, tuple(contraction))
 
     def nearest(self, values: Array) -> Array:
         """Return the nearest step to each number."""
@@ -108,20 +110,25 @@ class GridRounding:
         for name, ends in grids.items():
             bits = choices.of_part(name)
             assert isinstance(bits, int)
-            axes = [Steps.of(ends[at : at + 4], bits) for at in (0, 4, 8)] if name == "means" else []
-            steps[name] = tuple(axes) or Steps.of(ends, bits)
+            if name == "means":
+                steps[name] = tuple(Steps.of(ends[at : at + 4], bits) for at in (0, 4, 8))
+            else:
+                steps[name] = Steps.of(ends, bits)
         return cls(steps)
 
     def __call__(self, model: Model) -> Model:
         """Return the model in the file, its rows in the given order; traced."""
-        gaussians, shown, steps = model.gaussians, model.appearance, self.steps
+        gaussians = model.gaussians
+        shown = model.appearance
+        steps = self.steps
 
         def nearest(name: str, values: Array) -> Array:
             return steps[name].nearest(values) if name in steps else values
 
         def bands(blocks: Array, first: int) -> Array:
             """Round blocks [M, K, 3] of the bands from degree `first` on, each on its own grid."""
-            rounded, start = [blocks[:, :0]], 0
+            rounded = [blocks[:, :0]]
+            start = 0
             for degree in range(first, MAX_DEGREE + 1):
                 if start < blocks.shape[1]:
                     rounded.append(nearest(f"sh_{degree}", blocks[:, start : start + 2 * degree + 1]))
@@ -129,23 +136,27 @@ class GridRounding:
             return jnp.concatenate(rounded, axis=1)
 
         def texels(bucket: Array) -> Array:
-            parts = nearest("texel_colors", bucket[..., :3]), nearest("texel_alphas", bucket[..., 3:])
+            parts = (nearest("texel_colors", bucket[..., :3]), nearest("texel_alphas", bucket[..., 3:]))
             return jnp.concatenate(parts, axis=-1)
 
-        means, quats, logits = gaussians.means, gaussians.quats, gaussians.logit_opacities
+        means = gaussians.means
         if "means" in steps:
-            means = jnp.stack([own.nearest(means[:, axis]) for axis, own in enumerate(steps["means"])], 1)
+            means = jnp.stack([of_axis.nearest(means[:, axis]) for axis, of_axis in enumerate(steps["means"])], 1)
+        quats = gaussians.quats
         if "quats" in steps:
             quats = _with_w(nearest("quats", _xyz(quats)))
+        logits = gaussians.logit_opacities
         if "opacities" in steps:
             # The file has steps of opacities, not of logits.
             opacities = nearest("opacities", jax.nn.sigmoid(logits))
             logits = logit(jnp.clip(opacities, LEAST_OPACITY, 1 - LEAST_OPACITY))
         log_scales = nearest("log_scales", gaussians.log_scales)
-        if (table := shown.coefficients) is not None:
+        table = shown.coefficients
+        if table is not None:
             buckets = tuple(bands(blocks, gaussians.sh_degree + 1) for blocks in table.buckets)
             shown = shown.with_coefficients(dataclasses.replace(table, buckets=buckets))
-        if (textures := shown.textures) is not None:
+        textures = shown.textures
+        if textures is not None:
             shown = shown.with_textures(dataclasses.replace(textures, buckets=tuple(map(texels, textures.buckets))))
         if shown.shapes is not None and "shapes" in steps:
             # The file has steps of log-exponents; arctanh needs shares inside ±1.
@@ -196,12 +207,13 @@ class GradualRounding(StepEvent):
 def partly_rounded(rounding: GridRounding, model: Model, is_rounded: Model) -> Model:
     """Return a model of `half_turned` with some numbers rounded, given bools in the shapes of its floats; traced. w of
     a quaternion follows from x, y, z."""
-    (rounded, _), (before, rest) = partition(rounding(model)), partition(model)
+    rounded, _ = partition(rounding(model))
+    before, rest = partition(model)
     chosen: Model = jax.tree.map(jnp.where, is_rounded, rounded, before)
     # Rounded and exact x, y, z may be mixed in one quaternion: w must follow from the mixture.
     if "quats" in rounding.steps:
-        pair = _xyz(rounded.gaussians.quats), _xyz(before.gaussians.quats)
-        quats = _with_w(jnp.where(is_rounded.gaussians.quats[:, 1:], *pair))
+        xyz = (_xyz(rounded.gaussians.quats), _xyz(before.gaussians.quats))
+        quats = _with_w(jnp.where(is_rounded.gaussians.quats[:, 1:], *xyz))
         chosen = dataclasses.replace(chosen, gaussians=dataclasses.replace(chosen.gaussians, quats=quats))
     return combine(chosen, rest)
 
@@ -267,13 +279,16 @@ def tune_compact(
     if iterations < 1:
         raise ValueError(f"iterations must be at least 1; got {iterations}")
     if template_of(model.appearance) != stage.appearance:
-        wanted, shown = in_words(stage.appearance), in_words(model.appearance)
-        shown = f"{shown} with other options" if shown == wanted else shown
+        wanted = in_words(stage.appearance)
+        shown = in_words(model.appearance)
+        if shown == wanted:
+            shown += " with other options"
         raise ValueError(
             f"model must have what the last stage of the system, {stage.name!r}, trains, {wanted}; it has {shown}"
         )
     learned = {} if model.origin is None else model.origin.corrections
-    if missing := [correction.name for correction in stage.corrections if correction.name not in learned]:
+    missing = [correction.name for correction in stage.corrections if correction.name not in learned]
+    if missing:
         raise ValueError(
             f"model must have the corrections that training learned, {' and '.join(missing)}, which a compact file "
             "drops: give the model that training saved"
@@ -287,17 +302,17 @@ def tune_compact(
         iterations=iterations,
         rates=dataclasses.replace(stage.rates, means=RATE_OF_MEANS * stage.rates.means),
         events=(GradualRounding(GridRounding.to(grids, choices)),),
-        corrections=tuple(_held(type(own))(**own.__dict__) for own in stage.corrections),  # type: ignore[arg-type]
+        corrections=tuple(_held(type(each))(**each.__dict__) for each in stage.corrections),  # type: ignore[arg-type]
         # The model has its final degrees.
         raises_sh_degree=False,
         cools_down=True,
     )
     shared = {field.name: getattr(system, field.name) for field in dataclasses.fields(System)}
     # Tuning changes no sizes, so no budget applies.
-    own = {"memory_budget": None, "initial_gaussians": None, "sh_degree": start.gaussians.sh_degree}
-    one_stage = _OneStage(**shared | own, stage=tuning)
-    found = fit_stage(scene, one_stage, 0, start, progress=progress, title=title).model
-    return Tuned(dataclasses.replace(found, origin=start.origin), choices, grids)
+    shared |= {"memory_budget": None, "initial_gaussians": None, "sh_degree": start.gaussians.sh_degree}
+    one_stage = _OneStage(**shared, stage=tuning)
+    tuned = fit_stage(scene, one_stage, 0, start, progress=progress, title=title).model
+    return Tuned(dataclasses.replace(tuned, origin=start.origin), choices, grids)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -320,7 +335,8 @@ def _held(kind: type[Correction]) -> type[Correction]:
     @pytree
     class Held(kind):  # type: ignore[misc, valid-type]
         # No penalty pulls at the rows, and no average moves them.
-        penalty, project = Correction.penalty, Correction.project
+        penalty = Correction.penalty
+        project = Correction.project
 
         def learning_rate(self, progress: Array) -> Array:
             return jnp.zeros_like(progress)
@@ -354,31 +370,34 @@ def smallest_tuned(
     Losses are in dB, by the first measure, of the tuned model's file against `model`. Trials are results of
     `measure_choices`, such as with `TUNED_LADDER`.
     """
-    found, latest = TunedFiles([]), model
-    tolerance, factor = max(FIRST_TOLERANCE, 2 * max_loss), 2.0
+    files = TunedFiles([])
+    latest = model
+    tolerance = max(FIRST_TOLERANCE, 2 * max_loss)
+    factor = 2.0
     for number in range(1, MOST_TUNINGS + 1):
         try:
             choices = smallest_within(model, losses, tolerance, trials).choices
         except TooMuchLostError:
             break
         # These choices were tuned already and are within the loss.
-        if found.chosen is not None and choices == found.chosen.choices:
+        if files.chosen is not None and choices == files.chosen.choices:
             break
         try:
             tuned = tune(latest, choices, number)
         except DivergedError as error:
-            return found._replace(diverged=str(error))
-        trial, latest = _measured(tuned, losses), tuned.model
-        found.tried.append(trial)
+            return files._replace(diverged=str(error))
+        latest = tuned.model
+        trial = _measured(tuned, losses)
+        files.tried.append(trial)
         if trial.losses[0] > max_loss:
             factor = math.sqrt(2)
             # A file within max_loss needs no tuning.
             tolerance = max(tolerance / factor, max_loss)
             continue
-        if found.chosen is None or trial.num_bytes < found.chosen.num_bytes:
-            found = found._replace(chosen=trial, tuned=tuned)
+        if files.chosen is None or trial.num_bytes < files.chosen.num_bytes:
+            files = files._replace(chosen=trial, tuned=tuned)
         tolerance *= factor
-    return found
+    return files
 
 
 def best_tuned(model: Model, losses: Sequence[Loss], max_bytes: int, trials: Sequence[Trial], tune: Tune) -> TunedFiles:
@@ -387,24 +406,25 @@ def best_tuned(model: Model, losses: Sequence[Loss], max_bytes: int, trials: Seq
     Training spreads numbers, so that a file becomes some percent longer. While it is too long, the tuned model is tuned
     again, for bits with which `model` takes fewer bytes, up to `MOST_TUNINGS` times in all.
     """
-    found, latest, target = TunedFiles([]), model, TIGHTER * max_bytes
+    files = TunedFiles([])
+    latest = model
+    target = TIGHTER * max_bytes
     for number in range(1, MOST_TUNINGS + 1):
         try:
             tuned = tune(latest, best_within(model, int(target), trials), number)
         except TooLargeError:
             break
         except DivergedError as error:
-            return found._replace(diverged=str(error))
-        trial, latest = _measured(tuned, losses), tuned.model
-        found.tried.append(trial)
+            return files._replace(diverged=str(error))
+        latest = tuned.model
+        trial = _measured(tuned, losses)
+        files.tried.append(trial)
         if trial.num_bytes <= max_bytes:
-            return found._replace(chosen=trial, tuned=tuned)
+            return files._replace(chosen=trial, tuned=tuned)
         target *= TIGHTER * max_bytes / trial.num_bytes
-    return found
+    return files
 
 
-def _measured(found: Tuned, losses: Sequence[Loss]) -> Trial:
+def _measured(tuned: Tuned, losses: Sequence[Loss]) -> Trial:
     """Return size and losses of a tuned model's file."""
-    data = found.data
-    again = decode_model(data)
-    return Trial(found.choices, len(data), tuple(loss(again) for loss in losses))
+    return trial_of(tuned.data, tuned.choices, losses)

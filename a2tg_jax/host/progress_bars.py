@@ -4,8 +4,9 @@ one per tenth and per three seconds."""
 import datetime
 import io
 import sys
+import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
@@ -15,6 +16,9 @@ PLAIN_SHARE = 0.1
 """Least share of the whole between plain lines."""
 PLAIN_SECONDS = 3.0
 """Least time between plain lines, in seconds."""
+
+TICK = 0.5
+"""Seconds between looks at what another program has done."""
 
 Item = TypeVar("Item")
 
@@ -76,6 +80,34 @@ def counting(title: str, total: int | None, unit: str, *, is_shown: bool = True)
         return
     with new_bar(total=total, desc=title, unit=unit, disable=not is_shown) as bar:
         yield bar
+
+
+@contextmanager
+def clock(title: str, *, is_shown: bool = True) -> Iterator[None]:
+    """Show the time since the start of a phase whose progress cannot be counted."""
+    if is_shown and not has_terminal():
+        print(f"{title} …", file=sys.stderr, flush=True)
+        is_shown = False
+    with new_bar(desc=title, bar_format="{desc}: {elapsed}", disable=not is_shown) as bar, ticking(bar.refresh):
+        yield
+
+
+@contextmanager
+def ticking(act: Callable[[], object]) -> Iterator[None]:
+    """Call a function every `TICK` seconds, in a thread, until the block ends."""
+    ended = threading.Event()
+
+    def tick() -> None:
+        while not ended.wait(TICK):
+            act()
+
+    thread = threading.Thread(target=tick, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
 
 
 class PlainCounter:

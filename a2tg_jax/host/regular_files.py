@@ -1,16 +1,14 @@
 """Untrusted files: only regular files up to a size limit are opened.
 
-Links are followed if they lead to a regular file: reading a device never ends, and a pipe waits for a writer. Remote
-files (`host.remote_files`) are fetched into temporary files.
+Links are followed if they lead to a regular file: reading a device never ends, and a pipe waits for a writer.
 """
 
 import hashlib
 import os
+import re
 import stat
 from io import BufferedReader
 from pathlib import Path
-
-from a2tg_jax.host.remote_files import fetched, is_remote, listed, remote_entry, too_large
 
 MOST_ARRAY_BYTES = 1 << 34
 """Largest file of arrays: models, checkpoints, weights, point clouds and COLMAP's models."""
@@ -18,6 +16,7 @@ LARGEST_RATIO, FREE_ROOM = 64, 1 << 20
 """Largest growth of an untrusted file that is unpacked: a multiple of its size, and bytes that any file may have."""
 LFS_POINTER, MOST_POINTER_BYTES = b"version https://git-lfs.github.com/spec/", 1024
 """Beginning and size limit of the text that git-lfs leaves for a file (https://github.com/git-lfs/git-lfs, spec)."""
+URL = re.compile(r"[A-Za-z][\w+.:-]+://")
 READING = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 """Flags to open a file for reading bytes, without waiting for a pipe's writer or changing newlines."""
 
@@ -26,7 +25,15 @@ def expanded(path: str | os.PathLike[str]) -> Path:
     """Return a path of the user, with the home folder for a leading ~, as a shell expands it.
 
     Not for names in files: a scene in the current folder might name a photograph ~/private.png.
+
+    Raises:
+      ValueError: if it is no path, or a URL. The message leaves out what follows its scheme, such as a password.
     """
+    if not isinstance(path, str | os.PathLike):
+        raise ValueError(f"a path must be text or a Path; got {path!r}")
+    scheme = URL.match(os.fspath(path))
+    if scheme is not None:
+        raise ValueError(f"{scheme[0]}…: is a URL; mount the bucket (rclone mount), or copy the files to this machine")
     # Unlike Path.expanduser, it leaves the name of an unknown user as it is.
     return Path(os.path.expanduser(path))
 
@@ -42,24 +49,14 @@ def is_regular(path: str | os.PathLike[str]) -> bool:
     Raises:
       ValueError: naming the path, if a device, a pipe or a socket is there.
     """
-    if is_remote(path):
-        entry = remote_entry(path)
-        return entry is not None and entry.kind == "file"
     path = Path(path)
     if path.exists() and not path.is_file() and not path.is_dir():
         raise ValueError(_refusal(path))
     return path.is_file()
 
 
-def is_folder(path: Path) -> bool:
-    """Return whether a path is a folder. Object storage has no empty folders."""
-    return bool(listed(path)) if is_remote(path) else path.is_dir()
-
-
 def names_in(folder: Path) -> list[str]:
     """Return the sorted names of the files and folders in a folder; none if there is no such folder."""
-    if is_remote(folder):
-        return sorted(listed(folder))
     return sorted(os.listdir(folder)) if folder.is_dir() else []
 
 
@@ -70,26 +67,23 @@ def open_regular(path: str | os.PathLike[str], most_bytes: int = MOST_ARRAY_BYTE
       OSError: if it cannot be opened.
       ValueError: naming the path, if it is not a regular file, is larger, or is a pointer of git-lfs.
     """
-    file = fetched(path, most_bytes) if is_remote(path) else _opened_here(path, most_bytes)
-    if os.fstat(file.fileno()).st_size < MOST_POINTER_BYTES and file.peek().startswith(LFS_POINTER):
-        file.close()
-        raise ValueError(
-            f"{path}: is a pointer of git-lfs, a text that replaces the file; run `git lfs pull` in its repository"
-        )
-    return file
-
-
-def _opened_here(path: str | os.PathLike[str], most_bytes: int) -> BufferedReader:
     # Opening alone can have effects on a device.
     if not stat.S_ISREG(os.stat(path).st_mode):
         raise ValueError(_refusal(path))
     # A pipe may have replaced it meanwhile; opening does not wait for its writer.
     file = open(os.open(path, READING), "rb")  # noqa: SIM115 - the caller closes it
     status = os.fstat(file.fileno())
-    if stat.S_ISREG(status.st_mode) and status.st_size <= most_bytes:
+    if not stat.S_ISREG(status.st_mode):
+        reason = _refusal(path)
+    elif status.st_size > most_bytes:
+        size = f"{status.st_size:,} bytes, and {most_bytes:,}"
+        reason = f"{path}: has {size} are the most that such a file may have"
+    elif status.st_size < MOST_POINTER_BYTES and file.peek().startswith(LFS_POINTER):
+        reason = f"{path}: is a pointer of git-lfs, a text that replaces the file; run `git lfs pull` in its repository"
+    else:
         return file
     file.close()
-    raise ValueError(too_large(path, status.st_size, most_bytes) if stat.S_ISREG(status.st_mode) else _refusal(path))
+    raise ValueError(reason)
 
 
 def read_regular(path: str | os.PathLike[str], most_bytes: int) -> bytes:

@@ -13,8 +13,9 @@ import numpy as np
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.json_text import parse_json
 from a2tg_jax.host.npz import read_npz
-from a2tg_jax.host.regular_files import expanded, is_folder, is_regular
+from a2tg_jax.host.regular_files import expanded
 from a2tg_jax.host.text import shortened
+from a2tg_jax.io.validate import check_exists
 
 FORMAT = "a2tg-jax checkpoint"
 VERSION = 1
@@ -52,15 +53,15 @@ def read_archive(
     file. ValueError: it is not such an archive, is damaged, lacks one of the names, or has another version."""
     path = expanded(path)
     # Naming a run folder instead of its model is a likely mistake.
-    if is_folder(path):
-        found = sorted(path.glob("models/*.npz"))
-        raise ValueError(f"{path}: is a folder; name a file{f', such as {found[0]}' if found else ''}")
-    if not is_regular(path):
-        raise FileNotFoundError(f"{path}: no such {format}")
+    if path.is_dir():
+        models = sorted(path.glob("models/*.npz"))
+        raise ValueError(f"{path}: is a folder; name a file{f', such as {models[0]}' if models else ''}")
+    check_exists(path, format)
     try:
         arrays = read_npz(path, lambda name: name == HEADER or names is None or name in names)
-        if missing := [name for name in (HEADER, *(names or ())) if name not in arrays]:
-            raise ValueError(f"it has no {missing[0]}")
+        for name in (HEADER, *(names or ())):
+            if name not in arrays:
+                raise ValueError(f"it has no {name}")
         header = parse_json(arrays.pop(HEADER).tobytes())
         if not isinstance(header, dict):
             raise ValueError("its header is not a JSON object")

@@ -1,8 +1,8 @@
 """Columns of numbers as small integers and compressed bytes, and back.
 
-Numbers become even steps between two ends, positions steps along a Z curve, and both become planes of one byte each,
-which established libraries compress without loss. `ColumnReader` reads the named columns of a `ColumnWriter`, and
-never unpacks more than its limit, whatever the bytes claim.
+Numbers are rounded to even steps between two ends, and positions become places along a Z curve. The numbers of these
+steps are split into planes of one byte each, which established libraries compress without loss. `ColumnReader` reads
+the named columns of a `ColumnWriter`, and never unpacks more than its limit, whatever the bytes claim.
 
 All arrays are numpy's, on the host; C columns of n numbers are [C, n]. A precision is a number of bits or a float type.
 """
@@ -19,14 +19,14 @@ import numpy as np
 import zstandard
 from PIL import Image
 
+from a2tg_jax.io.validate import numbers_of
+
 Precision = int | Literal["float32", "float16"]
 Choice = Literal["smallest", "lzma", "zstd", "webp", "deflate", "none"]
 """Name of a coder, or "smallest" for the one with fewest bytes. Browsers decode deflate and none."""
 CODERS = ("lzma", "zstd", "deflate", "none", "webp")
 # Codes of 16 bits fit two planes, and keys of three axes, 48 bits, an int64.
 MOST_BITS = 16
-# Readers return float32.
-LARGEST_FLOAT = float(np.finfo(np.float32).max)
 LEAST_OPACITY = 1e-7
 ZSTD_LEVEL = 19  # Higher levels are zstd's "ultra", whose windows cost readers more memory.
 LZMA_FILTERS = [
@@ -88,17 +88,15 @@ def _decoded(coder: str, data: bytes, num_planes: int, length: int) -> np.ndarra
     if coder == "none":
         return np.frombuffer(data, np.uint8)
     if coder in ("lzma", "deflate"):
-        is_lzma = coder == "lzma"
-        stream: Any = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=LZMA_FILTERS) if is_lzma else zlib.decompressobj()
-        found = stream.decompress(data, size + 1)  # One more byte reveals excess data.
+        stream: Any = zlib.decompressobj()
+        if coder == "lzma":
+            stream = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=LZMA_FILTERS)
+        decoded = stream.decompress(data, size + 1)  # One more byte reveals excess data.
         if not stream.eof or stream.unused_data:
             raise ValueError("it does not end where it should")
-        return np.frombuffer(found, np.uint8)
+        return np.frombuffer(decoded, np.uint8)
     if coder == "zstd":
-        announced = zstandard.get_frame_parameters(data).content_size
-        if announced != size:  # The library would allocate this many bytes.
-            raise ValueError(f"its frame has {announced} bytes")
-        return np.frombuffer(zstandard.ZstdDecompressor().decompress(data, allow_extra_data=False), np.uint8)
+        return np.frombuffer(unzstd(data, size), np.uint8)
     num, height, width = _webp_shape(num_planes, length)
     with Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
         # Before any pixel is decoded: the header alone decides how much Pillow allocates.
@@ -108,6 +106,21 @@ def _decoded(coder: str, data: bytes, num_planes: int, length: int) -> np.ndarra
     planes = pixels.reshape(num, height * width, WEBP_CHANNELS).transpose(0, 2, 1).reshape(-1, height * width)
     # The last image is padded to three channels, and each plane to a whole rectangle.
     return planes[:num_planes, :length]
+
+
+def unzstd(data: bytes, size: int) -> bytes:
+    """Return the bytes of a zstd frame. ValueError: it is damaged, or of another size."""
+    try:
+        announced = zstandard.get_frame_parameters(data).content_size
+        # The library allocates what the frame announces.
+        if announced not in (size, zstandard.CONTENTSIZE_UNKNOWN):
+            raise ValueError(f"its frame announces {announced:,} bytes")
+        unpacked: bytes = zstandard.ZstdDecompressor().decompress(data, max_output_size=size, allow_extra_data=False)
+    except zstandard.ZstdError as error:
+        raise ValueError(str(error)) from error
+    if len(unpacked) != size:
+        raise ValueError(f"it unpacks to {len(unpacked):,} bytes; {size:,} were announced")
+    return unpacked
 
 
 def _webp_shape(num_planes: int, length: int) -> tuple[int, int, int]:
@@ -133,7 +146,8 @@ def ends_of(values: np.ndarray, bits: int) -> Ends:
     """
     if not values.size:
         return Ends(0.0, 0.0)
-    low, high = float(values.min()), float(values.max())
+    low = float(values.min())
+    high = float(values.max())
     if low < 0 < high and bits > 1:
         # One step fewer leaves room for moving the ends, so that no number is cut.
         step = (high - low) / ((1 << bits) - 2)
@@ -316,8 +330,10 @@ class ColumnWriter:
         planes = np.ascontiguousarray(planes)
         num, height, width = _webp_shape(*planes.shape)
         # WebP, the last of CODERS, cannot hold large planes.
-        fitting = CODERS if max(num * height, width) <= LONGEST_WEBP_SIDE else CODERS[:-1]
-        coded = {coder: encode(coder, planes) for coder in (fitting if self.coder == "smallest" else (self.coder,))}
+        tried: Sequence[str] = (self.coder,)
+        if self.coder == "smallest":
+            tried = CODERS if max(num * height, width) <= LONGEST_WEBP_SIDE else CODERS[:-1]
+        coded = {coder: encode(coder, planes) for coder in tried}
         coder, piece = min(coded.items(), key=lambda pair: len(pair[1]))
         self._pieces.append(piece)
         self.parts.append((name, coder, len(piece)))
@@ -368,7 +384,8 @@ class ColumnReader:
     """
 
     def __init__(self, body: bytes, parts: Iterable[Sequence[Any]], ends: Mapping[str, Any], room: int):
-        self._ends_by_name, self._room = ends, room
+        self._ends_by_name = ends
+        self._room = room
         self._parts: dict[str, list[tuple[str, bytes]]] = {}
         start = 0
         for name, coder, length in parts:
@@ -402,8 +419,9 @@ class ColumnReader:
 
     def end(self) -> None:
         """Raise ValueError unless all parts were read."""
-        if left := [name for name, parts in self._parts.items() if parts]:
-            raise ValueError(f"the part {left[0]} is unknown")
+        for name, parts in self._parts.items():
+            if parts:
+                raise ValueError(f"the part {name} is unknown")
 
     def exact(self, name: str, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
         planes = self.planes(name, np.dtype(dtype).itemsize, math.prod(shape))
@@ -446,16 +464,11 @@ class ColumnReader:
         # sinh overflows for ends that a damaged file claims; `_finite` reports this.
         with np.errstate(over="ignore"):
             codes = from_morton(np.cumsum(from_planes(planes, 1)[0]), precision)
-            axes = [AxisSteps(*own).values(axis, precision) for axis, own in zip(codes, known, strict=True)]
+            axes = [AxisSteps(*steps).values(axis, precision) for axis, steps in zip(codes, known, strict=True)]
         return _finite("means", np.stack(axes))
 
     def _ends(self, name: str, count: int) -> list[float]:
-        found = self._ends_by_name[name]
-        # Type, not isinstance: a bool must not pass as a number.
-        is_right = isinstance(found, list) and len(found) == count and all(type(x) in (int, float) for x in found)
-        if not is_right or not all(abs(x) <= LARGEST_FLOAT for x in found):
-            raise ValueError(f"the ends of {name} must be {count} numbers; got {found}")
-        return [float(x) for x in found]
+        return numbers_of(self._ends_by_name[name], count, f"the ends of {name}").tolist()
 
 
 def _finite(name: str, values: np.ndarray, dtype: Any = np.float32) -> np.ndarray:

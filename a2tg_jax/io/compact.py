@@ -17,6 +17,7 @@ import numpy as np
 
 from a2tg_jax.appearance import Appearance
 from a2tg_jax.appearance.parts import MAX_DEGREE, log_exponents_of, shapes_of
+from a2tg_jax.core.checks import check_int, check_literal
 from a2tg_jax.core.gaussians import check_gaussians
 from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.host.atomic import write_whole
@@ -53,7 +54,8 @@ from a2tg_jax.texture import MAX_SIDE
 
 # As in PNG: CR LF shows a transfer as text, 0x1A ends a listing on Windows.
 MAGIC = b"a2tgz\r\n\x1a"
-VERSION, OLD_VERSIONS = 3, (1, 2)
+VERSION = 3
+OLD_VERSIONS = (1, 2)
 """Versions 1 and 2, without and with kernel shapes, had one chunk, a zstd header, and a table for each property of the
 parts."""
 HEAD = struct.Struct("<8sHIII")
@@ -61,10 +63,13 @@ HEAD = struct.Struct("<8sHIII")
 ORIGIN_DTYPES = {
     "viewmats": "f8", "Ks": "f8", "sizes": "i4", "is_test": "u1", "scale": "f8", "rotation": "f8", "translation": "f8",
 }  # fmt: skip
+COLORED = {"sh_0", "sh_1", "sh_2", "sh_3", "texel_colors"}
+"""Names of the parts whose columns are red, green and blue."""
 FLOATERS = "floaters"
 """Name of the parts with the scores of floaters, which only files for browsers have."""
-LARGEST_CHUNK, LEAST_CHUNK = 16384, 256
-"""Numbers of rows in a chunk of a file for browsers."""
+LARGEST_CHUNK = 16384
+LEAST_CHUNK = 256
+"""Limits of the number of rows in a chunk of a file for browsers."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,8 +117,7 @@ class CompactChoices(NamedFields):
             is_bits = type(precision) is int and 1 <= precision <= MOST_BITS
             if not is_bits and precision not in ("float32", "float16"):
                 raise ValueError(f"choices.{name} must be 1 to {MOST_BITS} bits, float32 or float16; got {precision!r}")
-        # The round trip checks the coder against its Literal.
-        config_from_dict(type(self), config_to_dict(self), "choices")
+        check_literal("choices.coder", self.coder, Choice)
         return self
 
 
@@ -210,13 +214,14 @@ def encode_model(
     bits = choices.means if isinstance(choices.means, int) else MOST_BITS
     # With the grids of a tuned model, whose numbers are on these steps: others would round them again.
     known = np.reshape((grids or {}).get("means", ()), (-1, 4)).tolist()
-    axes = [AxisSteps(*own) for own in known] or [AxisSteps.of(x, bits) for x in rows.means.T]
+    axes = [AxisSteps(*steps) for steps in known] or [AxisSteps.of(x, bits) for x in rows.means.T]
     keys = morton(np.stack([axis.codes(x, bits) for axis, x in zip(axes, rows.means.T, strict=True)]), bits)
     # Within each chunk, rows follow the Z curve: neighbours in space have similar numbers, which code well.
     starts = range(0, max(num, 1), chunk)
     order = np.concatenate([part[np.argsort(keys[part], kind="stable")] for part in np.split(order, starts[1:])])
     # With given grids no splat is turned: its numbers were tuned as they are.
-    rows, keys = ordered(rows, order, turns=grids is None), keys[order]
+    rows = ordered(rows, order, turns=grids is None)
+    keys = keys[order]
     header: dict[str, Any] = {
         "num": num,
         "chunk": chunk,
@@ -225,14 +230,17 @@ def encode_model(
         "appearance": appearance_to_dict(model.appearance),
         "background": list(model.background),
     }
-    header["degrees"], header["degree_counts"] = (x.tolist() for x in np.unique(rows.degrees, return_counts=True))
+    degrees, degree_counts = np.unique(rows.degrees, return_counts=True)
+    header |= {"degrees": degrees.tolist(), "degree_counts": degree_counts.tolist()}
     if rows.sizes is not None:
-        header["sizes"], header["size_counts"] = (x.tolist() for x in np.unique(rows.sizes, axis=0, return_counts=True))
+        sizes, size_counts = np.unique(rows.sizes, axis=0, return_counts=True)
+        header |= {"sizes": sizes.tolist(), "size_counts": size_counts.tolist()}
     if page is not None:
         header["page"] = dict(page)
     ends = dict(grids or {})
     if len(starts) > 1:  # All chunks have the same steps.
-        for name, values, precision, _ in _columns(rows, choices):
+        for name, values in _columns(rows, choices):
+            precision = choices.of_part(name)
             if isinstance(precision, int):
                 ends.setdefault(name, ends_of(values, precision))
 
@@ -250,14 +258,13 @@ def encode_model(
                 writer.means(axes, keys[places], bits)
             else:
                 writer.numbers("means", part.means.T, choices.means)
-            writer.indices("degrees", np.searchsorted(header["degrees"], part.degrees), len(header["degrees"]))
+            writer.indices("degrees", np.searchsorted(degrees, part.degrees), len(degrees))
             if part.sizes is not None:
                 # A pair of sides as one number, which orders pairs as np.unique does.
-                pairs = np.reshape(header["sizes"], (-1, 2)), part.sizes
-                table, found = (sizes @ [MAX_SIDE + 1, 1] for sizes in pairs)
-                writer.indices("sizes", np.searchsorted(table, found), len(table))
-            for name, values, precision, is_color in _columns(part, choices):
-                writer.numbers(name, values, precision, is_color=is_color)
+                table, wanted = (np.reshape(pairs, (-1, 2)) @ [MAX_SIDE + 1, 1] for pairs in (sizes, part.sizes))
+                writer.indices("sizes", np.searchsorted(table, wanted), len(table))
+            for name, values in _columns(part, choices):
+                writer.numbers(name, values, choices.of_part(name), is_color=name in COLORED)
             if floaters is not None:
                 writer.planes(FLOATERS, floaters[order[places]][None])
         return framed(header | {"parts": writer.parts, "ends": writer.ends}, writer.body), writer.num_unpacked
@@ -267,21 +274,20 @@ def encode_model(
     return data if num_unpacked <= room_of(len(data)) else encoded("none")[0]
 
 
-def _columns(rows: Rows, choices: CompactChoices) -> Iterator[tuple[str, np.ndarray, Precision, bool]]:
-    """Yield name, numbers [C, n], precision, and whether they are colours, of each group besides the means."""
-    yield "log_scales", rows.log_scales.T, choices.log_scales, False
-    yield "quats", rows.quats[:, 1:].T, choices.quats, False
-    opacities = opacities_of(rows.logit_opacities) if isinstance(choices.opacities, int) else rows.logit_opacities
-    yield "opacities", opacities[None], choices.opacities, False
+def _columns(rows: Rows, choices: CompactChoices) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield the name and the numbers [C, n] of each part besides the means. Bits are of opacities and log-exponents,
+    floats of logits and shapes."""
+    yield "log_scales", rows.log_scales.T
+    yield "quats", rows.quats[:, 1:].T
+    has_bits = isinstance(choices.opacities, int)
+    yield "opacities", (opacities_of(rows.logit_opacities) if has_bits else rows.logit_opacities)[None]
     for degree, band in enumerate(rows.bands):
-        name = f"sh_{degree}"
-        yield name, band.transpose(2, 1, 0).reshape(3, -1), choices.of_part(name), True
+        yield f"sh_{degree}", band.transpose(2, 1, 0).reshape(3, -1)
     if rows.texels is not None:
-        yield "texel_colors", rows.texels[:, :3].T, choices.texels, True
-        yield "texel_alphas", rows.texels[:, 3:].T, choices.texels, False
+        yield "texel_colors", rows.texels[:, :3].T
+        yield "texel_alphas", rows.texels[:, 3:].T
     if rows.shapes is not None:
-        is_bits = isinstance(choices.shapes, int)
-        yield "shapes", (log_exponents_of(rows.shapes) if is_bits else rows.shapes)[None], choices.shapes, False
+        yield "shapes", (log_exponents_of(rows.shapes) if isinstance(choices.shapes, int) else rows.shapes)[None]
 
 
 def half_turned(model: Model) -> Model:
@@ -307,10 +313,12 @@ def decode_model(data: bytes, where: str = "the compact scene") -> Model:
         appearance = appearance_from_dict(header["appearance"])
         check_encodable(appearance)
         reader = ColumnReader(body, header["parts"], header["ends"], room_of(len(data)))
-        num, chunk = header["num"], header.get("chunk", max(header["num"], 1))
-        if type(num) is not int or num < 0 or type(chunk) is not int or chunk < 1:
-            raise ValueError(f"must have a number of rows, in chunks; got {num!r}, {chunk!r}")
-        parts, has_floaters = [], any(name == FLOATERS for name, *_ in header["parts"])
+        num = header["num"]
+        check_int("num", num, 0)
+        chunk = header.get("chunk", max(num, 1))
+        check_int("chunk", chunk, 1)
+        has_floaters = any(name == FLOATERS for name, *_ in header["parts"])
+        parts = []
         for start in range(0, max(num, 1), chunk):
             length = min(chunk, num - start)
             parts.append(_rows_of(reader, length, header, choices, appearance))
@@ -318,12 +326,12 @@ def decode_model(data: bytes, where: str = "the compact scene") -> Model:
                 reader.planes(FLOATERS, 1, length)  # They follow from the rows.
         origin = None
         if "origin" in header:
-            shapes = origin_shapes(len(header["origin"]["names"]))
-            arrays = {
-                name: reader.exact(f"origin_{name}", shape, ORIGIN_DTYPES[name]) for name, shape in shapes.items()
-            }
+            arrays = {}
+            for name, shape in origin_shapes(len(header["origin"]["names"])).items():
+                arrays[name] = reader.exact(f"origin_{name}", shape, ORIGIN_DTYPES[name])
             # numpy's bool is a byte in the file, and `origin_of` takes no integers for it.
-            origin = origin_of(header["origin"], arrays | {"is_test": arrays["is_test"].astype(bool)})
+            arrays["is_test"] = arrays["is_test"].astype(bool)
+            origin = origin_of(header["origin"], arrays)
         reader.end()
         return model_of(joined_rows(parts), header["base_degree"], appearance, origin, background_of(header))
 
@@ -363,15 +371,21 @@ def _rows_of(
     reader: ColumnReader, num: int, header: Mapping[str, Any], choices: CompactChoices, appearance: Appearance
 ) -> Rows:
     """Return the tables of a chunk; the reader limits their size by the file's."""
-    base, table = header["base_degree"], header["degrees"]
-    if type(base) is not int or not 0 <= base <= MAX_DEGREE:
-        raise ValueError(f"must have a base degree in 0..{MAX_DEGREE}; got {base!r}")
+
+    def numbers(name: str, num_columns: int, length: int) -> np.ndarray:
+        return reader.numbers(name, num_columns, length, choices.of_part(name), is_color=name in COLORED)
+
+    base = header["base_degree"]
+    check_int("base_degree", base, 0, MAX_DEGREE)
     means = reader.means(num, choices.means).T
-    log_scales = reader.numbers("log_scales", 2, num, choices.log_scales).T
-    quats = with_w(reader.numbers("quats", 3, num, choices.quats))
-    opacities = reader.numbers("opacities", 1, num, choices.opacities)[0]
+    log_scales = numbers("log_scales", 2, num).T
+    quats = with_w(numbers("quats", 3, num))
+    logits = numbers("opacities", 1, num)[0]
+    if isinstance(choices.opacities, int):
+        logits = logits_of(logits)
     # Splats of an appearance with bands may have any degree up to the highest, however low the base is.
     highest = MAX_DEGREE if appearance.bands is not None else base
+    table = header["degrees"]
     if not set(table) <= set(range(base, highest + 1)):
         raise ValueError(f"degrees must be in {base}..{highest}; got {table}")
     degrees = np.asarray(table, np.int64)[reader.indices("degrees", num, len(table))]
@@ -379,23 +393,19 @@ def _rows_of(
     for degree in range(highest + 1):
         # Band l has rows only for splats of degree l or more.
         count = int(np.count_nonzero(degrees >= degree))
-        name = f"sh_{degree}"
-        columns = reader.numbers(name, 3, (2 * degree + 1) * count, choices.of_part(name), is_color=True)
+        columns = numbers(f"sh_{degree}", 3, (2 * degree + 1) * count)
         bands.append(columns.reshape(3, 2 * degree + 1, count).transpose(2, 1, 0))
-    sizes, texels = None, None
+    sizes = texels = shapes = None
     if "sizes" in header:
         pairs = header["sizes"]
-        if not all(type(side) is int and 0 <= side <= MAX_SIDE for size in pairs for side in size):
-            raise ValueError(f"texture sides must be in 0..{MAX_SIDE}; got {pairs}")
-        if any(len(size) != 2 for size in pairs):
-            raise ValueError(f"texture sides must be pairs; got {pairs}")
+        for height, width in pairs:
+            check_int("the height of a texture", height, 0, MAX_SIDE)
+            check_int("the width of a texture", width, 0, MAX_SIDE)
         sizes = np.asarray(pairs, np.int64).reshape(-1, 2)[reader.indices("sizes", num, len(pairs))]
         count = int(sizes.prod(axis=1).sum())
-        colors = reader.numbers("texel_colors", 3, count, choices.texels, is_color=True)
-        texels = np.concatenate([colors, reader.numbers("texel_alphas", 1, count, choices.texels)]).T
-    shapes = None
+        texels = np.concatenate([numbers("texel_colors", 3, count), numbers("texel_alphas", 1, count)]).T
     if appearance.exponents is not None:
-        shapes = reader.numbers("shapes", 1, num, choices.shapes)[0]
-        shapes = shapes_of(shapes) if isinstance(choices.shapes, int) else shapes
-    logits = logits_of(opacities) if isinstance(choices.opacities, int) else opacities
+        shapes = numbers("shapes", 1, num)[0]
+        if isinstance(choices.shapes, int):
+            shapes = shapes_of(shapes)
     return Rows(means, quats, log_scales, logits, degrees, tuple(bands), sizes, texels, shapes)

@@ -39,7 +39,8 @@ def config_from_dict(
     if not isinstance(data, Mapping):
         raise ValueError(f"{where} must hold the fields of {kind.__name__}; got {shortened(repr(data))}")
     # Annotations may be strings (PEP 563): `field.type` would not do.
-    hints, values = typing.get_type_hints(kind), dict(given or {})
+    hints = typing.get_type_hints(kind)
+    values = dict(given or {})
     fields = {field.name: field for field in dataclasses.fields(kind) if field.name not in values}  # type: ignore[arg-type]
     within = f"{where} " if where.endswith(":") else f"{where}."
     for name in data:
@@ -47,7 +48,8 @@ def config_from_dict(
             # Dotted names are the command line's; files nest tables.
             group, _, option = name.partition(".")
             instead = did_you_mean(name, fields) or f"; it has {', '.join(fields)}"
-            instead = f"; use {group}={{{option!r}: …}}" if option and group in fields else instead
+            if option and group in fields:
+                instead = f"; use {group}={{{option!r}: …}}"
             raise ValueError(f"{within}{shortened(name)} is an unknown key{instead}")
     for name, field in fields.items():
         if name in data:
@@ -73,7 +75,9 @@ def check_config(config: Any, prefix: str = "") -> None:
     except NameError:
         return
     for field in dataclasses.fields(config):
-        name, hint, value = prefix + field.name, hints[field.name], getattr(config, field.name)
+        name = prefix + field.name
+        hint = hints[field.name]
+        value = getattr(config, field.name)
         if isinstance(hint, type) and dataclasses.is_dataclass(hint):
             given = ", ".join(f"{key}={item!r}" for key, item in value.items()) if isinstance(value, Mapping) else "…"
             check_kind(name, value, hint, f"use {hint.__name__}({shortened(given)})")
@@ -138,7 +142,8 @@ def _from_json(hint: object, value: Any, where: str) -> Any:
 def _as(hint: Any, value: object) -> Any:
     """Return a JSON value as a plain type; an integer may be a float, a bool is no number. TypeError: its type is
     another."""
-    origin, inner = typing.get_origin(hint), typing.get_args(hint)
+    origin = typing.get_origin(hint)
+    inner = typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         for alternative in inner:
             with contextlib.suppress(TypeError):
@@ -165,16 +170,17 @@ def _as(hint: Any, value: object) -> Any:
 
 def _type_name(hint: Any) -> str:
     """Return a type in words; tuples are lists, as in files."""
-    origin, inner = typing.get_origin(hint), [item for item in typing.get_args(hint) if item is not ...]
+    origin = typing.get_origin(hint)
+    inner = [item for item in typing.get_args(hint) if item is not ...]
     if origin is typing.Literal:
         return f"one of {', '.join(map(str, inner))}"
     if origin in (dict, Mapping):
         return "dict"
+    names = list(map(_type_name, inner))
+    if origin is tuple and len(names) > 1 and len(set(names)) == 1:
+        return f"list of {len(names)} {names[0]}"
     if origin is tuple:
-        same = len(set(inner)) == 1 and len(inner) > 1
-        return (
-            f"list of {len(inner)} {_type_name(inner[0])}" if same else f"list of {', '.join(map(_type_name, inner))}"
-        )
-    if inner:
-        return " | ".join(map(_type_name, inner))
+        return f"list of {', '.join(names)}"
+    if names:
+        return " | ".join(names)
     return "None" if hint is type(None) else hint.__name__

@@ -13,10 +13,10 @@ from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.origin import Color, Origin
 from a2tg_jax.core.similarity import Similarity, check_similarity
 from a2tg_jax.host.atomic import write_whole
-from a2tg_jax.host.regular_files import expanded
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.columns import AxisSteps
-from a2tg_jax.io.saved_file import VERSION, load_saved, numbers_of
+from a2tg_jax.io.saved_file import VERSION, load_saved
+from a2tg_jax.io.validate import numbers_of
 from a2tg_jax.model import Model
 
 # As in web/src/extent.ts.
@@ -65,19 +65,23 @@ def load_edit(path: Path) -> Edit:
       FileNotFoundError: if there is no such file.
       ValueError: if it is invalid, naming the file.
     """
-    return load_saved(expanded(path), "edit", _edit_of)
+    return load_saved(path, "edit", _edit_of)
 
 
 def save_edit(path: Path, edit: Edit) -> None:
     """Write an edit as the viewer does, for `load_edit`."""
     changes: dict[str, Any] = {}
     if edit.crop is not None:
-        sides = {"low": edit.crop.low.tolist(), "high": edit.crop.high.tolist()}
-        limits = {name: [x if math.isfinite(x) else None for x in side] for name, side in sides.items()}
-        changes["crop"] = {"axes": edit.crop.axes.tolist(), **limits}
-    changes |= {"floaters": edit.floaters} if edit.floaters else {}
-    changes |= {} if edit.up is None else {"up": edit.up.tolist()}
-    changes |= {} if edit.background is None else {"background": list(edit.background)}
+        changes["crop"] = {"axes": edit.crop.axes.tolist()}
+        for name, ends in (("low", edit.crop.low), ("high", edit.crop.high)):
+            # JSON has no infinity.
+            changes["crop"][name] = [end if math.isfinite(end) else None for end in ends.tolist()]
+    if edit.floaters:
+        changes["floaters"] = edit.floaters
+    if edit.up is not None:
+        changes["up"] = edit.up.tolist()
+    if edit.background is not None:
+        changes["background"] = list(edit.background)
     write_whole(path, json.dumps({"format": "a2tg-jax edit", "version": VERSION, **changes}, indent=1) + "\n")
 
 
@@ -96,45 +100,54 @@ def crop_box(model: Model, up: np.ndarray, low: np.ndarray, high: np.ndarray) ->
     across = near - (near @ up) * up
     across /= np.linalg.norm(across)
     axes = np.stack([across, np.cross(up, across), up])
-    middle, reach = axes @ centre, REACH * np.linalg.norm(axes * half, axis=1)
+    middle = axes @ centre
+    reach = REACH * np.linalg.norm(axes * half, axis=1)
     begin, end = (middle + (2 * share - 1) * reach for share in (low, high))
     return Box(axes, np.where(low > 0, begin, -math.inf), np.where(high < 1, end, math.inf))
 
 
 def _edit_of(data: dict[str, Any]) -> Edit:
-    if unknown := sorted(set(data) - {"format", "version", "crop", "floaters", "up", "background"}):
+    unknown = sorted(set(data) - {"format", "version", "crop", "floaters", "up", "background"})
+    if unknown:
         raise ValueError(f"has the unknown entry {shortened(unknown[0])}")
     floaters = data.get("floaters", 0.0)
     if type(floaters) not in (int, float) or not 0 <= floaters <= 1:
         raise ValueError(f"floaters must be a number from 0 to 1; got {shortened(repr(floaters))}")
-    crop, up, background = data.get("crop"), data.get("up"), data.get("background")
+    crop = data.get("crop")
     if crop is not None:
-        if not isinstance(crop, dict):
-            raise ValueError(f"crop must be an object; got {shortened(crop)}")
-        rows = crop.get("axes", np.eye(3).tolist())
-        if not isinstance(rows, list) or len(rows) != 3:
-            raise ValueError(f"crop.axes must be 3 directions; got {shortened(rows)}")
-        axes = np.stack([numbers_of(row, 3, "crop.axes") for row in rows])
-        check_similarity(Similarity(1.0, axes, np.zeros(3)), "crop.axes")
-        low = numbers_of(crop.get("low"), 3, "crop.low", null=-math.inf)
-        high = numbers_of(crop.get("high"), 3, "crop.high", null=math.inf)
-        crop = Box(axes, low, high)
+        crop = _box_of(crop)
+    up = data.get("up")
     if up is not None:
         up = numbers_of(up, 3, "up")
         if not np.linalg.norm(up) > 0:
             raise ValueError("up must not be zero")
         up = up / np.linalg.norm(up)
+    background = data.get("background")
     if background is not None:
         red, green, blue = numbers_of(background, 3, "background").tolist()
         background = (red, green, blue)
     return Edit(crop, float(floaters), up, background)
 
 
+def _box_of(crop: object) -> Box:
+    if not isinstance(crop, dict):
+        raise ValueError(f"crop must be an object; got {shortened(crop)}")
+    rows = crop.get("axes", np.eye(3).tolist())
+    if not isinstance(rows, list) or len(rows) != 3:
+        raise ValueError(f"crop.axes must be 3 directions; got {shortened(rows)}")
+    axes = np.stack([numbers_of(row, 3, "crop.axes") for row in rows])
+    check_similarity(Similarity(1.0, axes, np.zeros(3)), "crop.axes")
+    low = numbers_of(crop.get("low"), 3, "crop.low", null=-math.inf)
+    high = numbers_of(crop.get("high"), 3, "crop.high", null=math.inf)
+    return Box(axes, low, high)
+
+
 def scores_of(model: Model) -> np.ndarray:
     """Return `floater_scores` of the Gaussians that exist."""
-    gaussians, origin = model.live.gaussians, model.origin or Origin.of_cameras([])
-    cameras = (origin.viewmats, origin.Ks, origin.sizes)
-    return floater_scores(np.asarray(gaussians.means), np.asarray(gaussians.log_scales), *cameras)
+    gaussians = model.live.gaussians
+    origin = model.origin or Origin.of_cameras([])
+    numbers = (np.asarray(gaussians.means), np.asarray(gaussians.log_scales))
+    return floater_scores(*numbers, origin.viewmats, origin.Ks, origin.sizes)
 
 
 def apply_edit(model: Model, edit: Edit) -> Model:

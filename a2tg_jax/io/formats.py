@@ -5,7 +5,6 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import BLACK
 from a2tg_jax.data.other_runs import model_hint
 from a2tg_jax.host.regular_files import expanded, is_regular
@@ -14,12 +13,12 @@ from a2tg_jax.io.compact import load_compact, save_compact
 from a2tg_jax.io.gltf import load_gltf, save_gltf
 from a2tg_jax.io.gltf_container import buffer_files
 from a2tg_jax.io.model_file import load_model, save_model
-from a2tg_jax.io.other_programs import World, cut_numbers, writer_as
+from a2tg_jax.io.other_programs import World, cut_numbers, reader_of, writer_as
 from a2tg_jax.io.ply import encode_packed_ply, load_ply_model, save_ply
 from a2tg_jax.io.sog import HEADER, STREAMED_HEADER, encode_sog, load_sog, sog_files
-from a2tg_jax.io.splat_files import encode_ksplat, encode_splat, load_ksplat, load_splat
-from a2tg_jax.io.spz import encode_spz, load_spz
-from a2tg_jax.io.torch_checkpoint import load_checkpoint_gaussians, save_checkpoint_gaussians
+from a2tg_jax.io.splat_files import decode_ksplat, decode_splat, encode_ksplat, encode_splat
+from a2tg_jax.io.spz import decode_spz, encode_spz
+from a2tg_jax.io.torch_checkpoint import refuse_checkpoint, save_checkpoint_gaussians
 from a2tg_jax.io.usd import import_usd, load_usd, save_usd
 from a2tg_jax.model import Model
 
@@ -38,7 +37,7 @@ class FileFormat:
     """Format of files, and what it keeps of a model besides its Gaussians."""
 
     name: str
-    load: Callable[[Path], Model | Gaussians]
+    load: Callable[[Path], Model]
     save: Writer | None
     keeps_appearance: bool = False
     """Whether textures, and everything else that splats show, are kept."""
@@ -57,21 +56,31 @@ class FileFormat:
     """Import of the optional library that writing needs; raises ValueError, with what to install, without it."""
 
 
-_GLTF = FileFormat("glTF", load_gltf, save_gltf, True, True, is_exact=False, has_extension=True)
+_GLTF = FileFormat(
+    "glTF", load_gltf, save_gltf, keeps_appearance=True, keeps_origin=True, is_exact=False, has_extension=True
+)
 _USD = FileFormat("OpenUSD", load_usd, save_usd, keeps_origin=True, is_exact=False, import_library=import_usd)
-_CHECKPOINT = FileFormat("checkpoint", load_checkpoint_gaussians, save_checkpoint_gaussians)
+_CHECKPOINT = FileFormat("checkpoint", refuse_checkpoint, save_checkpoint_gaussians)
 FORMATS = {
-    ".npz": FileFormat("model", load_model, save_model, True, True, True),
-    ".a2tgz": FileFormat("compact scene", load_compact, save_compact, True, True, is_exact=False),
+    ".npz": FileFormat(
+        "model", load_model, save_model, keeps_appearance=True, keeps_origin=True, keeps_corrections=True
+    ),
+    ".a2tgz": FileFormat(
+        "compact scene", load_compact, save_compact, keeps_appearance=True, keeps_origin=True, is_exact=False
+    ),
     ".compressed.ply": FileFormat(
         "compressed PLY", load_ply_model, writer_as("compressed.ply", encode_packed_ply), is_exact=False
     ),
     ".ply": FileFormat("PLY", load_ply_model, save_ply),
-    ".spz": FileFormat("SPZ", load_spz, writer_as("spz", encode_spz), is_exact=False),
+    ".spz": FileFormat("SPZ", reader_of(decode_spz), writer_as("spz", encode_spz), is_exact=False),
     ".sog": FileFormat("SOG", load_sog, writer_as("sog", encode_sog), is_exact=False),
     HEADER: FileFormat("unbundled SOG", load_sog, None),
-    ".splat": FileFormat(".splat", load_splat, writer_as("splat", encode_splat), highest_degree=0, is_exact=False),
-    ".ksplat": FileFormat(".ksplat", load_ksplat, writer_as("ksplat", encode_ksplat), highest_degree=2, is_exact=False),
+    ".splat": FileFormat(
+        ".splat", reader_of(decode_splat), writer_as("splat", encode_splat), highest_degree=0, is_exact=False
+    ),
+    ".ksplat": FileFormat(
+        ".ksplat", reader_of(decode_ksplat), writer_as("ksplat", encode_ksplat), highest_degree=2, is_exact=False
+    ),
     **dict.fromkeys((".glb", ".gltf"), _GLTF),
     **dict.fromkeys((".usda", ".usdc", ".usdz", ".usd"), _USD),
     **dict.fromkeys((".pt", ".pth", ".ckpt"), _CHECKPOINT),
@@ -83,9 +92,9 @@ def format_of(path: str | os.PathLike[str]) -> FileFormat:
     """Return the format of a file by its suffix. ValueError: the suffix is unknown."""
     # Not Path.suffix: .compressed.ply has two dots.
     name = Path(path).name.lower()
-    for suffix, found in FORMATS.items():
+    for suffix, format in FORMATS.items():
         if name.endswith(suffix):
-            return found
+            return format
     near = did_you_mean(Path(name).suffix, FORMATS)
     if name.endswith(".zip"):
         near = "; if it is SOG, rename it to *.sog; otherwise unpack it"
@@ -96,12 +105,12 @@ def format_of(path: str | os.PathLike[str]) -> FileFormat:
 def writer_of(path: str | os.PathLike[str]) -> Writer:
     """Return the function that writes a file, by its suffix, after importing what it needs. ValueError: the suffix is
     unknown, an optional library is missing, or the format is read-only."""
-    found = format_of(path)
-    if found.save is None:
-        raise ValueError(f"{shortened(os.fspath(path))}: {found.name} can be read, but not written; write *.sog")
-    if found.import_library is not None:
-        found.import_library()
-    return found.save
+    format = format_of(path)
+    if format.save is None:
+        raise ValueError(f"{shortened(os.fspath(path))}: {format.name} can be read, but not written; write *.sog")
+    if format.import_library is not None:
+        format.import_library()
+    return format.save
 
 
 def splats_at(path: Path) -> Path:
@@ -127,8 +136,7 @@ def load_splats(path: str | os.PathLike[str]) -> Model:
       ValueError: if the suffix is unknown, an optional library is missing, or the file is damaged.
     """
     path = splats_at(expanded(path))
-    loaded = format_of(path).load(path)
-    return Model(loaded) if isinstance(loaded, Gaussians) else loaded
+    return format_of(path).load(path)
 
 
 def save_splats(path: str | os.PathLike[str], model: Model, *, world: World = "original") -> None:
@@ -150,7 +158,10 @@ def save_splats(path: str | os.PathLike[str], model: Model, *, world: World = "o
       200
     """
     save = writer_of(path)
-    save(expanded(path), model, **({} if format_of(path).keeps_origin else {"world": world}))
+    if format_of(path).keeps_origin:
+        save(expanded(path), model)
+    else:
+        save(expanded(path), model, world=world)
 
 
 def files_written(path: Path) -> list[Path]:
@@ -164,7 +175,7 @@ def files_of(path: Path) -> list[Path]:
     of an unbundled SOG."""
     if path.name.lower() == HEADER:
         return sog_files(path)
-    return [path, *(buffer_files(path) if path.suffix.lower() == ".gltf" else [])]
+    return [path, *buffer_files(path)] if path.suffix.lower() == ".gltf" else [path]
 
 
 def file_bytes(path: Path) -> int:
@@ -174,9 +185,12 @@ def file_bytes(path: Path) -> int:
 
 def _bakeable(model: Model) -> str:
     """Describe what a model shows that baking turns into plain splats; "" if nothing."""
-    has_textures, has_shapes = model.textures is not None, model.appearance.exponents is not None
-    found = " and ".join(["textures"] * has_textures + ["shapes of kernels"] * has_shapes)
-    return f"{found} (bake turns them into plain splats)" if found else ""
+    shown = []
+    if model.textures is not None:
+        shown.append("textures")
+    if model.appearance.exponents is not None:
+        shown.append("shapes of kernels")
+    return f"{' and '.join(shown)} (bake turns them into plain splats)" if shown else ""
 
 
 def unseen_elsewhere(model: Model, path: str | os.PathLike[str]) -> str:
@@ -186,9 +200,14 @@ def unseen_elsewhere(model: Model, path: str | os.PathLike[str]) -> str:
 
 def lost_by(model: Model, path: str | os.PathLike[str]) -> list[str]:
     """Describe what a file, by its suffix, does not keep of a model."""
-    into, shown, origin, lost = format_of(path), model.appearance, model.origin, list[str]()
+    into = format_of(path)
+    shown = model.appearance
+    origin = model.origin
+    lost: list[str] = []
     if not into.keeps_appearance:
-        lost += [found for found in [_bakeable(model)] if found]
+        bakeable = _bakeable(model)
+        if bakeable:
+            lost.append(bakeable)
         if not shown.is_portable and model.textures is None:
             lost.append(f"what {type(shown).__name__} shows besides Gaussians")
     # With bands the degree of `sh` is only the one that all splats share.

@@ -7,37 +7,52 @@ the extension A2TG_splat_textures; programs without it show plain splats. docs/f
 
 import os
 import warnings
-from collections.abc import Mapping
-from typing import Any, Literal, get_args
+from collections.abc import Iterator, Mapping
+from typing import Any, Literal
 
 import numpy as np
 
 from a2tg_jax.appearance import Appearance, TextureOptions, appearance_for
 from a2tg_jax.appearance.base import PARTS
 from a2tg_jax.appearance.parts import MAX_DEGREE, log_exponents_of, shapes_of
+from a2tg_jax.core.checks import check_int, check_literal
 from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.host.regular_files import expanded
 from a2tg_jax.host.text import PROGRAM, shortened
-from a2tg_jax.io import other_programs as others
-from a2tg_jax.io.columns import LARGEST_FLOAT, Ends, dequantised, ends_of, quantised
+from a2tg_jax.io.columns import Ends, dequantised, ends_of, quantised
 from a2tg_jax.io.config_json import config_from_dict
 from a2tg_jax.io.gltf_container import Builder, Document, mesh_nodes
 from a2tg_jax.io.model_file import appearance_from_dict, appearance_to_dict, background_of, origin_of
 from a2tg_jax.io.model_rows import Rows, check_encodable, model_of, rows_of_model
-from a2tg_jax.io.spz import GLTF_AXES, spz_model
-from a2tg_jax.io.validate import check_model, check_suffix, live_model, reading
+from a2tg_jax.io.other_programs import (
+    Ellipsoids,
+    degree_to_read,
+    gaussians_of,
+    joined_parts,
+    linear_colors,
+    matrix_of,
+    origin_to_json,
+    splats_of,
+    upright,
+)
+from a2tg_jax.io.spz import GLTF_AXES, decode_spz
+from a2tg_jax.io.validate import check_model, check_suffix, live_model, numbers_of, reading
 from a2tg_jax.model import Model
 from a2tg_jax.texture import MAX_SIDE
 
-SPLATS, EXTENSION = "KHR_gaussian_splatting", "A2TG_splat_textures"
+SPLATS = "KHR_gaussian_splatting"
+EXTENSION = "A2TG_splat_textures"
 SPZ = (
     f"{SPLATS}_compression_spz_2", f"{SPLATS}_compression_spz", "KHR_spz_gaussian_splats_compression",
 )  # fmt: skip
 """Drafts of an extension whose bufferView is an SPZ file: inside `SPLATS`, the last one instead of it."""
 READ = {SPLATS, EXTENSION, *SPZ, "KHR_mesh_quantization", "KHR_materials_unlit"}
 """Extensions that a file may require."""
-MEANS, ROTATION, SCALE, OPACITY = "POSITION", f"{SPLATS}:ROTATION", f"{SPLATS}:SCALE", f"{SPLATS}:OPACITY"
+MEANS = "POSITION"
+ROTATION = f"{SPLATS}:ROTATION"
+SCALE = f"{SPLATS}:SCALE"
+OPACITY = f"{SPLATS}:OPACITY"
 DESCRIBED = {
     "kernel": "ellipse",
     "colorSpace": "srgb_rec709_display",
@@ -90,15 +105,15 @@ def save_gltf(
       >>> a2tg.load_gltf("scene.glb").num
       200
     """
-    if texels not in get_args(TexelKind):
-        raise ValueError(f"texels must be {' or '.join(get_args(TexelKind))}; got {shortened(repr(texels))}")
+    check_literal("texels", texels, TexelKind)
     model = live_model(path, model, "save_gltf")
     # glTF has no accessors of count 0.
     if not model.num:
         raise ValueError("model has no Gaussians; a glTF file has at least one")
     if textures:
         check_encodable(model.appearance, "a glTF file", "a *.ply, or textures=False here, holds their plain splats")
-    builder, splats = Builder(), others.splats_of(model, keeps_shapes=textures)
+    builder = Builder()
+    splats = splats_of(model, keeps_shapes=textures)
     attributes = {
         # glTF requires bounds of POSITION, and of no other attribute.
         MEANS: builder.add(splats.means, has_bounds=True),
@@ -108,7 +123,7 @@ def save_gltf(
         OPACITY: builder.add(splats.opacities),
     }
     # Linear RGB and opacity as bytes, for programs that show points.
-    shown = others.linear_colors(np.clip(splats.sh[:, 0] * SH_C0 + 0.5, 0.0, 1.0))
+    shown = linear_colors(np.clip(splats.sh[:, 0] * SH_C0 + 0.5, 0.0, 1.0))
     points = np.rint(255 * np.concatenate([shown, splats.opacities[:, None]], axis=1)).astype(np.uint8)
     attributes["COLOR_0"] = builder.add(points, normalized=True)
     # The extension stores one attribute for each coefficient, not one array.
@@ -119,13 +134,14 @@ def save_gltf(
     described: dict[str, Any] = dict(DESCRIBED)
     kept: dict[str, Any] = {}
     if textures:
-        if extended := _extension_of(builder, model, texels):
+        extended = _extension_of(builder, model, texels)
+        if extended:
             described["extensions"] = {EXTENSION: extended}
         kept["appearance"] = appearance_to_dict(model.appearance)
     kept["background"] = list(model.background)
     if model.origin is not None:
-        kept["origin"] = others.origin_to_json(model.origin)
-    matrix = others.matrix_of(others.upright(model.origin, "y"))
+        kept["origin"] = origin_to_json(model.origin)
+    matrix = matrix_of(upright(model.origin, "y"))
     # glTF's matrices are column by column: transposed, then row by row.
     node = {"name": "splats", "mesh": 0, "matrix": matrix.T.ravel().tolist()}
     # Mode 0: points, which programs without the extension show.
@@ -144,18 +160,22 @@ def save_gltf(
 def _extension_of(builder: Builder, model: Model, kind: TexelKind) -> dict[str, Any]:
     """Add the appearance of splats to a file, and return the extension's object; empty for plain splats."""
     described: dict[str, Any] = {}
-    rows, appearance = rows_of_model(model), model.appearance
+    rows = rows_of_model(model)
+    appearance = model.appearance
     if appearance.texture_options is not None and rows.sizes is not None and rows.texels is not None:
         described |= {name: getattr(appearance.texture_options, field) for name, field in OPTIONS.items()}
         described["sizes"] = builder.add(rows.sizes.astype(np.uint8), is_attribute=False)
         if len(rows.texels) and kind == "float32":
             described["texels"] = builder.add(rows.texels.astype(np.float32), is_attribute=False)
         elif len(rows.texels):
-            ends = {name: ends_of(rows.texels[:, columns], 8) for name, columns in RANGES.items()}
-            codes = [quantised(rows.texels[:, columns], ends[name], 8) for name, columns in RANGES.items()]
-            as_bytes = np.concatenate(codes, axis=1).astype(np.uint8)
-            described["texels"] = builder.add(as_bytes, normalized=True, is_attribute=False)
-            described["texelRanges"] = {name: list(found) for name, found in ends.items()}
+            codes = np.zeros(rows.texels.shape, np.uint8)
+            ranges: dict[str, list[float]] = {}
+            for name, columns in RANGES.items():
+                ends = ends_of(rows.texels[:, columns], 8)
+                codes[:, columns] = quantised(rows.texels[:, columns], ends, 8)
+                ranges[name] = list(ends)
+            described["texels"] = builder.add(codes, normalized=True, is_attribute=False)
+            described["texelRanges"] = ranges
     if appearance.bands is not None:
         described["baseDegree"] = model.gaussians.sh_degree
         described["degrees"] = builder.add(rows.degrees.astype(np.uint8), is_attribute=False)
@@ -190,15 +210,18 @@ def load_gltf(path: str | os.PathLike[str]) -> Model:
     path = expanded(path)
     with reading(path):
         document = Document(path)
-        if unknown := [name for name in document.json.get("extensionsRequired", []) if name not in READ]:
+        unknown = [name for name in document.json.get("extensionsRequired", []) if name not in READ]
+        if unknown:
             raise ValueError(f"needs the extension {shortened(unknown[0])}, which this program does not read")
-        parts = (
-            (_model_of(document, primitive), matrix)
-            for node, matrix in mesh_nodes(document)
-            for primitive in document.entry("meshes", node["mesh"])["primitives"]
-            if {SPLATS, SPZ[-1]} & {*primitive.get("extensions", {})}
-        )
-        return others.joined_parts(parts, "y")
+        return joined_parts(_parts(document), "y")
+
+
+def _parts(document: Document) -> Iterator[tuple[Model, np.ndarray]]:
+    """Yield the model of each set of splats in the scene, and the matrix from its world to the scene's."""
+    for node, matrix in mesh_nodes(document):
+        for primitive in document.entry("meshes", node["mesh"])["primitives"]:
+            if {SPLATS, SPZ[-1]} & {*primitive.get("extensions", {})}:
+                yield _model_of(document, primitive), matrix
 
 
 def _model_of(document: Document, primitive: Mapping[str, Any]) -> Model:
@@ -208,11 +231,13 @@ def _model_of(document: Document, primitive: Mapping[str, Any]) -> Model:
     for name in SPZ:
         if name in inside:
             # Cesium and others read the axes of the SPZ as glTF's, which are its default axes.
-            return spz_model(document.view(inside[name]["bufferView"], name), document.path, GLTF_AXES)
+            data = bytes(document.view(inside[name]["bufferView"], name))
+            return decode_spz(data, document.path, GLTF_AXES)
     splats = _splats(document, primitive["attributes"])
     for name in ("kernel", "colorSpace"):
-        if (found := described.get(name)) != DESCRIBED[name]:
-            message = f"its splats have the {name} {shortened(found)}; they are read as {DESCRIBED[name]}"
+        value = described.get(name)
+        if value != DESCRIBED[name]:
+            message = f"its splats have the {name} {shortened(value)}; they are read as {DESCRIBED[name]}"
             warnings.warn(f"{document.path}: {message}", stacklevel=5)
     extras = primitive.get("extras", {})
     kept = extras.get(OWN, {}) if isinstance(extras, dict) else {}
@@ -222,35 +247,36 @@ def _model_of(document: Document, primitive: Mapping[str, Any]) -> Model:
         shown, rows, base_degree = _shown(document, extended, splats)
         appearance = _kept_appearance(kept, shown, is_described=True)
         return model_of(rows, base_degree, appearance, origin, background_of(kept))
-    gaussians = others.gaussians_of(splats, document.path, is_flat=False)
+    gaussians = gaussians_of(splats, document.path, is_flat=False)
     appearance = _kept_appearance(kept, Appearance(), is_described=False)
     model = Model(gaussians, appearance, background=background_of(kept), origin=origin)
     check_model(model)
     return model
 
 
-def _splats(document: Document, attributes: Mapping[str, object]) -> others.Ellipsoids:
+def _splats(document: Document, attributes: Mapping[str, object]) -> Ellipsoids:
     def numbers(name: str, kind: str) -> np.ndarray:
         if name not in attributes:
             raise ValueError(f"its splats lack {name}")
         return document.numbers(attributes[name], kind, name)
 
-    # xyzw to wxyz.
-    means, quats = numbers(MEANS, "VEC3"), numbers(ROTATION, "VEC4")[:, [3, 0, 1, 2]]
-    scales, opacities = numbers(SCALE, "VEC3"), numbers(OPACITY, "SCALAR")[:, 0]
+    means = numbers(MEANS, "VEC3")
+    quats = numbers(ROTATION, "VEC4")[:, [3, 0, 1, 2]]  # xyzw to wxyz.
+    scales = numbers(SCALE, "VEC3")
+    opacities = numbers(OPACITY, "SCALAR")[:, 0]
     tried = range(MAX_DEGREE + 2)  # One more than is read, for the warning.
-    found = max((degree for degree in tried if coefficient(degree, 0) in attributes), default=0)
-    degree = others.degree_to_read(found, str(document.path))
+    highest = max((degree for degree in tried if coefficient(degree, 0) in attributes), default=0)
+    degree = degree_to_read(highest, str(document.path))
     names = [coefficient(band, order) for band in range(degree + 1) for order in range(2 * band + 1)]
-    columns = [means, quats, scales, opacities, *(numbers(name, "VEC3") for name in names)]
-    if len({len(column) for column in columns}) > 1:
+    sh = [numbers(name, "VEC3") for name in names]
+    if {len(column) for column in (quats, scales, opacities, *sh)} != {len(means)}:
         raise ValueError("the attributes of its splats differ in length")
-    return others.Ellipsoids(means, quats, scales, opacities, np.stack(columns[4:], axis=1))
+    return Ellipsoids(means, quats, scales, opacities, np.stack(sh, axis=1))
 
 
-def _shown(document: Document, described: Mapping[str, Any], splats: others.Ellipsoids) -> tuple[Appearance, Rows, int]:
+def _shown(document: Document, described: Mapping[str, Any], splats: Ellipsoids) -> tuple[Appearance, Rows, int]:
     """Return the template, the tables and the common degree of splats, from the extension's object. ValueError: a field
-    is missing, out of range, or contradicts the others."""
+    is missing, out of range, or contradicts the"""
     num, highest = splats.sh.shape[:2]
     base_degree = sh_degree = NUM_BASES.index(highest)
     has_textures, has_degrees, has_shapes = (name in described for name in ("sizes", "degrees", "shapes"))
@@ -266,33 +292,31 @@ def _shown(document: Document, described: Mapping[str, Any], splats: others.Elli
             raise ValueError(f"{EXTENSION}.{name} must be {num} integers in 0..{most}")
         return values.astype(np.int64)
 
-    sizes, texels, shapes, degrees = None, None, None, np.full(num, sh_degree)
+    sizes = texels = shapes = None
+    degrees = np.full(num, sh_degree)
     if has_textures:
         sizes = integers("sizes", "VEC2", MAX_SIDE)
         texels = _texels(document, described, int(sizes.prod(axis=1).sum()))
     if has_degrees:
-        degrees, base_degree = integers("degrees", "SCALAR", MAX_DEGREE)[:, 0], described["baseDegree"]
-        least, most = int(degrees.min(initial=sh_degree)), int(degrees.max(initial=0))
-        if type(base_degree) is not int or not 0 <= base_degree <= least or most > sh_degree:
-            raise ValueError(
-                f"{EXTENSION}.degrees must range from baseDegree to the {sh_degree} of the splats; got {least}..{most} "
-                f"and {shortened(base_degree)}"
-            )
+        degrees = integers("degrees", "SCALAR", sh_degree)[:, 0]
+        base_degree = described["baseDegree"]
+        check_int(f"{EXTENSION}.baseDegree", base_degree, 0, int(degrees.min(initial=sh_degree)))
     if has_shapes:
         log_exponents = document.numbers(described["shapes"], "SCALAR", f"{EXTENSION}.shapes")[:, 0]
         if len(log_exponents) != num:
             raise ValueError(f"{EXTENSION}.shapes must be {num} numbers; got {len(log_exponents)}")
         shapes = shapes_of(log_exponents)
     # No rows are dropped: the extension's tables are by row.
-    gaussians = others.gaussians_of(splats, document.path, is_flat=has_textures or has_shapes, keeps_all=True)
+    gaussians = gaussians_of(splats, document.path, is_flat=has_textures or has_shapes, keeps_all=True)
     # `Bands` keeps tables up to the highest degree, empty ones included.
-    sh = splats.sh if not has_degrees else np.pad(splats.sh, ((0, 0), (0, NUM_BASES[-1] - highest), (0, 0)))
+    sh = splats.sh
+    if has_degrees:
+        sh = np.pad(sh, ((0, 0), (0, NUM_BASES[-1] - highest), (0, 0)))
     counts = [count for count in NUM_BASES if count <= sh.shape[1]]
     bands = [sh[degrees >= degree, count - 2 * degree - 1 : count] for degree, count in enumerate(counts)]
-    rows = Rows(
-        np.asarray(gaussians.means), np.asarray(gaussians.quats), np.asarray(gaussians.log_scales),
-        np.asarray(gaussians.logit_opacities), degrees, tuple(bands), sizes, texels, shapes,
-    )  # fmt: skip
+    fields = (gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities)
+    means, quats, log_scales, logits = map(np.asarray, fields)
+    rows = Rows(means, quats, log_scales, logits, degrees, tuple(bands), sizes, texels, shapes)
     return appearance, rows, base_degree
 
 
@@ -304,10 +328,8 @@ def _texels(document: Document, described: Mapping[str, Any], count: int) -> np.
     if len(texels) != count:
         raise ValueError(f"{EXTENSION}.sizes need {count} texels, but there are {len(texels)}")
     for name, columns in RANGES.items() if "texelRanges" in described else ():
-        low, high = described["texelRanges"][name]
-        if not all(type(end) in (int, float) and abs(end) <= LARGEST_FLOAT for end in (low, high)):
-            raise ValueError(f"{EXTENSION}.texelRanges.{name} must be two numbers")
-        texels[:, columns] = dequantised(texels[:, columns] * 255.0, Ends(low, high), 8)
+        ends = numbers_of(described["texelRanges"][name], 2, f"{EXTENSION}.texelRanges.{name}").tolist()
+        texels[:, columns] = dequantised(texels[:, columns] * 255.0, Ends(*ends), 8)
     return texels
 
 
@@ -323,12 +345,12 @@ def _kept_appearance(kept: Mapping[str, Any], shown: Appearance, *, is_described
         return shown
     appearance = appearance_from_dict(kept["appearance"])
     # Extras may be out of date if another program has edited the extension: then this decides.
-    own, there = appearance.texture_options, shown.texture_options
     is_same = all((getattr(appearance, part) is None) == (getattr(shown, part) is None) for part in PARTS)
     if is_described:
-        is_same &= appearance.alpha_limit == shown.alpha_limit and all(
-            getattr(own, field, None) == getattr(there, field, None)
-            for field in OPTIONS.values()
-            if field != "max_alpha"
-        )
+        is_same &= appearance.alpha_limit == shown.alpha_limit
+        saved = appearance.texture_options
+        there = shown.texture_options
+        for field in OPTIONS.values():
+            if field != "max_alpha":
+                is_same &= getattr(saved, field, None) == getattr(there, field, None)
     return appearance if appearance.is_portable and is_same else shown

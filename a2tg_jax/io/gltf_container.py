@@ -7,6 +7,7 @@ justifies.
 import base64
 import binascii
 import json
+import math
 import os
 import struct
 import urllib.parse
@@ -16,16 +17,21 @@ from typing import Any
 
 import numpy as np
 
+from a2tg_jax.core.checks import check_int
 from a2tg_jax.data.ply import turn_of
 from a2tg_jax.host.atomic import replacing, write_whole
 from a2tg_jax.host.json_text import parse_json
 from a2tg_jax.host.regular_files import LARGEST_RATIO, MOST_ARRAY_BYTES, is_regular, read_regular, room_of
 from a2tg_jax.host.text import shortened
-from a2tg_jax.io.validate import existing_bytes
+from a2tg_jax.io.validate import existing_bytes, numbers_of
 
-MAGIC, VERSION = b"glTF", 2
-JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942  # "JSON" and "BIN\0", little-endian.
-HEAD, CHUNK = struct.Struct("<4sII"), struct.Struct("<II")
+MAGIC = b"glTF"
+VERSION = 2
+JSON_CHUNK = 0x4E4F534A  # "JSON", little-endian.
+BINARY_CHUNK = 0x004E4942  # "BIN\0".
+HEAD = struct.Struct("<4sII")
+CHUNK = struct.Struct("<II")
+MOST_COUNT = 1 << 53  # JSON's numbers are exact up to this.
 MOST_GLB_BYTES = 2**32 - 1  # The header has the length as uint32.
 ARRAY_BUFFER = 34962  # OpenGL's number for vertex data.
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -60,15 +66,19 @@ class Builder:
           is_attribute: the numbers are an attribute of a mesh.
         """
         columns = values.reshape(len(values), -1)
-        code = next(code for code, name in COMPONENTS.items() if np.dtype(name) == values.dtype.newbyteorder("<"))
-        accessor: dict[str, Any] = {"bufferView": len(self._views), "componentType": code, "count": len(values)}
-        accessor["type"] = next(name for name, sides in SIDES.items() if sides == columns.shape[1])
+        dtype = values.dtype.newbyteorder("<")
+        accessor: dict[str, Any] = {
+            "bufferView": len(self._views),
+            "componentType": next(code for code, name in COMPONENTS.items() if np.dtype(name) == dtype),
+            "count": len(values),
+            "type": next(name for name, num in SIDES.items() if num == columns.shape[1]),
+        }
         if normalized:
             accessor["normalized"] = True
         if has_bounds:
             accessor |= {"min": columns.min(axis=0).tolist(), "max": columns.max(axis=0).tolist()}
         # glTF is little-endian.
-        data = np.ascontiguousarray(columns, np.dtype(COMPONENTS[code])).tobytes()
+        data = np.ascontiguousarray(columns, dtype).tobytes()
         self.add_bytes(data, **({"target": ARRAY_BUFFER} if is_attribute else {}))
         self.accessors.append(accessor)
         return len(self.accessors) - 1
@@ -106,9 +116,9 @@ class Builder:
         if total > MOST_GLB_BYTES:
             most = f"{MOST_GLB_BYTES:,} bytes, but these are {total:,}"
             raise ValueError(f"{path}: a *.glb holds up to {most}; write *.gltf")
+        start = HEAD.pack(MAGIC, VERSION, total) + CHUNK.pack(len(text), JSON_CHUNK)
         with replacing(path) as temporary, open(temporary, "wb") as file:
-            file.write(HEAD.pack(MAGIC, VERSION, total) + CHUNK.pack(len(text), JSON_CHUNK) + text)
-            file.write(CHUNK.pack(self._num_bytes, BINARY_CHUNK))
+            file.write(start + text + CHUNK.pack(self._num_bytes, BINARY_CHUNK))
             file.writelines(self._pieces)
 
 
@@ -122,14 +132,18 @@ class Document:
     def __init__(self, path: str | os.PathLike[str]):
         self.path = Path(path)
         data = existing_bytes(path, "glTF file")
-        text, self._binary = _split_glb(data) if data[:4] == MAGIC else (data, None)
+        self._binary: bytes | None = None
+        text = data
+        if data[:4] == MAGIC:
+            text, self._binary = _split_glb(data)
         try:
             self.json = parse_json(text)
         except ValueError as error:
             raise ValueError(f"is not glTF, or is damaged: {error}") from error
         if not isinstance(self.json, dict) or not isinstance(self.json.get("asset"), dict):
             raise ValueError("is not glTF")
-        if (version := self.json["asset"].get("version")) != "2.0":
+        version = self.json["asset"].get("version")
+        if version != "2.0":
             raise ValueError(f"is glTF of version {shortened(version)}; this program reads 2.0")
         self._buffers: dict[int, bytes] = {}
         self._files: dict[Path, bytes] = {}
@@ -149,44 +163,42 @@ class Document:
         ValueError, naming it `what`: it is missing, of another kind, or exceeds its buffer."""
         accessor = self.entry("accessors", index)
         if accessor.get("type") != kind or accessor.get("componentType") not in COMPONENTS:
-            found = f"{accessor.get('type')} of {accessor.get('componentType')}"
-            raise ValueError(f"{what} must be {kind} of numbers; got {shortened(found)}")
+            actual = f"{accessor.get('type')} of {accessor.get('componentType')}"
+            raise ValueError(f"{what} must be {kind} of numbers; got {shortened(actual)}")
         if "sparse" in accessor or "bufferView" not in accessor:
             raise ValueError(f"{what} is a sparse accessor, which this program does not read")
-        dtype, columns = np.dtype(COMPONENTS[accessor["componentType"]]), SIDES[kind]
-        view, size = self.entry("bufferViews", accessor["bufferView"]), dtype.itemsize * columns
-        data, start, length = self._within(view, what)
-        stride, count = _count(view, "byteStride", what, size), _count(accessor, "count", what)
+        dtype = np.dtype(COMPONENTS[accessor["componentType"]])
+        shape = (_count(accessor, "count", what), SIDES[kind])
+        size = dtype.itemsize * SIDES[kind]
+        data = self.view(accessor["bufferView"], what)
+        stride = _count(self.entry("bufferViews", accessor["bufferView"]), "byteStride", what, size)
         if stride < size or stride > max(size, MOST_STRIDE):
             raise ValueError(f"{what} has a stride of {stride} bytes for {size}")
-        first = start + _count(accessor, "byteOffset", what, 0)
-        if count and first + stride * (count - 1) + size > start + length:
-            raise ValueError(f"{what} has {count} entries, but its buffer is too short for them")
+        first = _count(accessor, "byteOffset", what, 0)
+        if shape[0] and first + stride * (shape[0] - 1) + size > len(data):
+            raise ValueError(f"{what} has {shape[0]} entries, but its buffer is too short for them")
         # Several accessors may share bytes, but each one's numbers take memory.
-        if 4 * count * columns > self._room:
-            raise ValueError(f"{what} would take {4 * count * columns} bytes, which the file is too small for")
-        self._room -= 4 * count * columns
-        rows = np.ndarray((count, columns), dtype, data, first if count else 0, (stride, dtype.itemsize))
+        num_bytes = 4 * math.prod(shape)
+        if num_bytes > self._room:
+            raise ValueError(f"{what} would take {num_bytes} bytes, which the file is too small for")
+        self._room -= num_bytes
+        rows = np.ndarray(shape, dtype, data, first, (stride, dtype.itemsize)) if shape[0] else np.zeros(shape, dtype)
         values = rows.astype(np.float32)
         if accessor.get("normalized") is True and dtype.kind != "f":
             # glTF: max(c / 127, −1) for signed bytes, since −128 would be below −1.
             values = np.maximum(values / np.float32(np.iinfo(dtype).max), np.float32(-1.0))
         return values
 
-    def view(self, index: object, what: str) -> bytes:
+    def view(self, index: object, what: str) -> memoryview:
         """Return the bytes of a buffer view. ValueError, naming it `what`: it is missing, or exceeds its buffer."""
-        data, start, length = self._within(self.entry("bufferViews", index), what)
-        return data[start : start + length]
-
-    def _within(self, view: Mapping[str, object], what: str) -> tuple[bytes, int, int]:
-        """Return the buffer of a view, the view's first byte, and its length."""
+        view = self.entry("bufferViews", index)
         data = self._buffer(view.get("buffer"), what)
         start = _count(view, "byteOffset", what, 0)
-        length = _count(view, "byteLength", what)
         # Python's integers do not overflow, so sums of claimed numbers are safe to compare.
-        if start + length > len(data):
+        end = start + _count(view, "byteLength", what)
+        if end > len(data):
             raise ValueError(f"{what} reaches beyond its buffer of {len(data)} bytes")
-        return data, start, length
+        return memoryview(data)[start:end]
 
     def _buffer(self, index: Any, what: str) -> bytes:
         """Return the bytes of a buffer; each is read once."""
@@ -194,13 +206,17 @@ class Document:
         length = _count(described, "byteLength", what)
         if index not in self._buffers:
             uri = described.get("uri")
+            if uri is not None:
+                self._buffers[index] = self._read(uri)
             # Only the first buffer may be the GLB's binary chunk.
-            if uri is None and (index != 0 or self._binary is None):
+            elif index == 0 and self._binary is not None:
+                self._buffers[index] = self._binary
+            else:
                 raise ValueError(f"has no bytes for buffers[{index}]")
-            self._buffers[index] = self._read(uri) if uri is not None else self._binary or b""
-        if (found := len(self._buffers[index])) < length:
-            raise ValueError(f"is cut off: its buffer has {found} bytes where {length} are announced")
-        return self._buffers[index]
+        data = self._buffers[index]
+        if len(data) < length:
+            raise ValueError(f"is cut off: its buffer has {len(data)} bytes where {length} are announced")
+        return data
 
     def _read(self, uri: Any) -> bytes:
         """Return the bytes of a buffer that is a file in the same folder, or embedded in the JSON."""
@@ -270,11 +286,9 @@ def _split_glb(data: bytes) -> tuple[bytes, bytes | None]:
 
 def _count(described: Mapping[str, object], name: str, what: str, default: int | None = None) -> int:
     """Return a field that is a non-negative integer."""
-    value = described.get(name, default)
-    # Not isinstance, for true is an int; 2^53 is where JSON's numbers stop being exact.
-    if type(value) is not int or not 0 <= value < 1 << 53:
-        raise ValueError(f"{what}: {name} must be a whole number; got {shortened(repr(value))}")
-    return value
+    value: Any = described.get(name, default)
+    check_int(f"{what}: {name}", value, 0, MOST_COUNT)
+    return int(value)
 
 
 # Nodes
@@ -323,11 +337,7 @@ def _local_matrix(node: Mapping[str, Any]) -> np.ndarray:
     """Return the matrix [4, 4] from a node to its parent, for columns."""
 
     def vector(name: str, default: list[float]) -> np.ndarray:
-        values = node.get(name, default)
-        is_right = isinstance(values, list) and len(values) == len(default)
-        if not is_right or not all(type(x) in (int, float) and abs(x) < 1e30 for x in values):
-            raise ValueError(f"{name} of a node must be {len(default)} numbers; got {shortened(values)}")
-        return np.asarray(values, np.float64)
+        return numbers_of(node.get(name, default), len(default), f"{name} of a node")
 
     if "matrix" in node:
         # Column by column in the file.

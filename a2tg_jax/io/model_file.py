@@ -31,8 +31,10 @@ from a2tg_jax.model import Model
 
 FORMAT = "a2tg-jax model"
 FIELDS = tuple(field.name for field in dataclasses.fields(Gaussians))
-APPEARANCE, ORIGIN, CORRECTIONS = "appearance/", "origin/", "corrections/"
-"""Prefixes of the names of their arrays."""
+APPEARANCE = "appearance/"
+ORIGIN = "origin/"
+CORRECTIONS = "corrections/"
+"""Prefixes of the names of arrays."""
 ORIGIN_KINDS: dict[str, tuple[str, str, Any]] = {
     "sizes": ("iu", "integers", np.int64),
     "is_test": ("b", "bool", np.bool_),
@@ -96,13 +98,16 @@ def load_model(path: str | os.PathLike[str], *, appearances: Sequence[type[Appea
         check_gaussians(gaussians)
         gaussians = jax.tree.map(jnp.asarray, gaussians)
         appearance = appearance_from_dict(header["appearance"], appearances)
-        shown = {name.removeprefix(APPEARANCE): array for name, array in arrays.items() if name.startswith(APPEARANCE)}
-        of_origin = {name.removeprefix(ORIGIN): array for name, array in arrays.items() if name.startswith(ORIGIN)}
-        origin = origin_of(header["origin"], of_origin) if "origin" in header else None
-        shown_by = with_arrays(appearance, shown, gaussians.sh_degree)
-        model = Model(gaussians, shown_by, background=background_of(header), origin=origin)
+        origin = origin_of(header["origin"], _below(ORIGIN, arrays)) if "origin" in header else None
+        appearance = with_arrays(appearance, _below(APPEARANCE, arrays), gaussians.sh_degree)
+        model = Model(gaussians, appearance, background=background_of(header), origin=origin)
         check_model(model)
         return model
+
+
+def _below(prefix: str, arrays: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arrays whose names have a prefix, by the rest of their names."""
+    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
 
 
 def number_in_file(path: str | os.PathLike[str]) -> int:
@@ -125,12 +130,12 @@ OLD_PARTS: dict[str, Any] = {"Shaped": {"exponents": Exponents()}, "Banded": {"b
 def appearance_to_dict(appearance: Appearance) -> dict[str, Any]:
     """Return the class and options of an appearance and of its parts."""
     kind = type(appearance)
-    parts = {name: _options_of(part) for name in PARTS if (part := getattr(appearance, name)) is not None}
+    parts = {name: getattr(appearance, name) for name in PARTS}
     described = {
         "module": kind.__module__,
         "name": kind.__qualname__,
         "options": _options_of(appearance),
-        "parts": parts,
+        "parts": {name: _options_of(part) for name, part in parts.items() if part is not None},
     }
     try:
         # Tried now: otherwise a model is lost only when someone loads it.
@@ -145,9 +150,11 @@ def appearance_to_dict(appearance: Appearance) -> dict[str, Any]:
 
 def appearance_from_dict(data: Mapping[str, Any], appearances: Sequence[type[Appearance]] = ()) -> Appearance:
     """Return the template that `appearance_to_dict` or version 0.2 described. ValueError: its class is unknown."""
-    name, options, module = data["name"], data["options"], data["module"]
-    is_own = module.partition(".")[0] == __name__.partition(".")[0]
-    if is_own and "parts" not in data:
+    name = data["name"]
+    module = data["module"]
+    is_built_in = module.partition(".")[0] == __name__.partition(".")[0]
+    if is_built_in and "parts" not in data:
+        options = data["options"]
         if name in OLD_PARTS:
             return dataclasses.replace(appearance_from_dict(data["held"]["inner"], appearances), **OLD_PARTS[name])
         if name == "Textured":
@@ -155,17 +162,17 @@ def appearance_from_dict(data: Mapping[str, Any], appearances: Sequence[type[App
         if name == "Plain":
             return appearance_for(config_from_dict(TextureOptions, options, "options of Plain"), has_textures=False)
     # The class was passed, is this package's, or is in a module that is already imported.
-    found: Any = next((kind for kind in appearances if kind.__qualname__ == name), None)
-    if found is None and is_own:
-        found = getattr(built_in, name, None)
-    if found is None:
-        found = getattr(sys.modules.get(module), name, None)
-    if not (isinstance(found, type) and issubclass(found, Appearance)):
+    kind: Any = next((each for each in appearances if each.__qualname__ == name), None)
+    if kind is None and is_built_in:
+        kind = getattr(built_in, name, None)
+    if kind is None:
+        kind = getattr(sys.modules.get(module), name, None)
+    if not (isinstance(kind, type) and issubclass(kind, Appearance)):
         raise ValueError(
             f"has the appearance {name} of the module {module}, which is unknown: import that module first, "
             f"or pass the class, load_model(path, appearances=({name.rpartition('.')[2]},))"
         )
-    return _appearance_of(found, data)
+    return _appearance_of(kind, data)
 
 
 def _options_of(node: Any) -> dict[str, Any]:
@@ -180,7 +187,7 @@ def _appearance_of(kind: type[Appearance], data: Mapping[str, Any]) -> Appearanc
         arrays = {field.name: None for field in dataclasses.fields(kind) if not field.metadata.get("static")}
         return config_from_dict(kind, options, f"options of {kind.__name__}", given={**arrays, **parts})
 
-    parts = {name: read(PART_CLASSES[name], own, {}) for name, own in data.get("parts", {}).items()}
+    parts = {name: read(PART_CLASSES[name], options, {}) for name, options in data.get("parts", {}).items()}
     return read(kind, data["options"], parts)
 
 
@@ -195,7 +202,10 @@ def background_of(header: Mapping[str, Any]) -> Color:
 
 def origin_header(origin: Origin) -> dict[str, Any]:
     """Return what JSON keeps of an origin: the names, and the vertical if it was chosen."""
-    return {"names": list(origin.names)} | ({} if origin.up is None else {"up": np.asarray(origin.up).tolist()})
+    header: dict[str, Any] = {"names": list(origin.names)}
+    if origin.up is not None:
+        header["up"] = np.asarray(origin.up).tolist()
+    return header
 
 
 def origin_arrays(origin: Origin) -> dict[str, np.ndarray]:
@@ -214,29 +224,32 @@ def origin_arrays(origin: Origin) -> dict[str, np.ndarray]:
 
 def origin_shapes(num: int) -> dict[str, tuple[int, ...]]:
     """Return the shapes of the arrays of an origin of some cameras."""
-    shapes: dict[str, tuple[int, ...]] = {"viewmats": (num, 4, 4), "Ks": (num, 3, 3), "sizes": (num, 2)}
-    return shapes | {"is_test": (num,), "scale": (), "rotation": (3, 3), "translation": (3,)}
+    return {
+        "viewmats": (num, 4, 4), "Ks": (num, 3, 3), "sizes": (num, 2), "is_test": (num,), "scale": (),
+        "rotation": (3, 3), "translation": (3,),
+    }  # fmt: skip
 
 
 def origin_of(data: Mapping[str, object], arrays: Mapping[str, Any]) -> Origin:
     """Return the origin of `origin_arrays`, which may be nested lists, and of `origin_header`. ValueError: a shape or a
     number is wrong."""
-    names, found = data["names"], dict[str, np.ndarray]()
+    names = data["names"]
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ValueError(f"origin/names must be texts; got {shortened(names)}")
+    checked: dict[str, Any] = {}
     for name, shape in origin_shapes(len(names)).items():
         kinds, what, dtype = ORIGIN_KINDS.get(name, ("iuf", "numbers", np.float64))
         array = np.asarray(arrays[name])
-        array = array if array.size else array.reshape(shape).astype(dtype)  # An empty list has no type.
+        if not array.size:  # An empty list has no type.
+            array = array.reshape(shape).astype(dtype)
         if array.dtype.kind not in kinds:
             raise ValueError(f"{ORIGIN}{name} must be {what}; got {array.dtype}")
         check_shape(ORIGIN + name, array, shape)
-        found[name] = array.astype(dtype)
-    # In the order of `origin_shapes`.
-    viewmats, Ks, sizes, is_test, scale, rotation, translation = found.values()
-    learned = {name.removeprefix(CORRECTIONS): rows for name, rows in arrays.items() if name.startswith(CORRECTIONS)}
-    world = Similarity(float(scale), rotation, translation)
-    up = data.get("up")
+        checked[name] = array.astype(dtype)
+    world = Similarity(float(checked.pop("scale")), checked.pop("rotation"), checked.pop("translation"))
+    up: Any = data.get("up")
     if up is not None:
-        check_shape(ORIGIN + "up", up := np.asarray(up, np.float64), (3,))
-    return Origin(viewmats, Ks, sizes, tuple(names), is_test, world, learned, up)
+        up = np.asarray(up, np.float64)
+        check_shape(ORIGIN + "up", up, (3,))
+    corrections = _below(CORRECTIONS, arrays)
+    return Origin(**checked, names=tuple(names), transform=world, corrections=corrections, up=up)

@@ -29,8 +29,10 @@ HALF_TURNS = np.array(
     np.float64,
 )
 """Row k: the matrix of q → q·(1, i, j, k) on wxyz, a half-turn about no axis, the first, the second, the third."""
-U_MIRRORED, V_MIRRORED = (2, 3), (1, 3)
-"""Axes of half-turns that mirror a texture's columns, and its rows."""
+U_MIRRORED = (2, 3)
+"""Axes of half-turns that mirror a texture's columns."""
+V_MIRRORED = (1, 3)
+"""Axes of half-turns that mirror a texture's rows."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +73,8 @@ def check_encodable(
 def rows_of_model(model: Model) -> Rows:
     """Return the tables of a model without unused rows, in its order. Raises as `check_model`."""
     check_model(model)
-    gaussians, shown = model.gaussians, arrays_of(model.appearance, model.gaussians.sh_degree)
+    gaussians = model.gaussians
+    shown = arrays_of(model.appearance, gaussians.sh_degree)
     sh = np.asarray(gaussians.sh)
     # NUM_BASES[l] = (l + 1)², and band l has 2l + 1 coefficients.
     bands = [sh[:, NUM_BASES[degree] - 2 * degree - 1 : NUM_BASES[degree]] for degree in range(gaussians.sh_degree + 1)]
@@ -81,8 +84,8 @@ def rows_of_model(model: Model) -> Rows:
         bands += [shown[f"band_{degree}"] for degree in range(gaussians.sh_degree + 1, len(NUM_BASES))]
     fields = (gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities)
     means, quats, log_scales, logits = map(np.asarray, fields)
-    optional = (shown.get(name) for name in ("sizes", "texels", "shapes"))
-    return Rows(means, quats, log_scales, logits, degrees, tuple(bands), *optional)
+    tables = (shown.get(name) for name in ("sizes", "texels", "shapes"))
+    return Rows(means, quats, log_scales, logits, degrees, tuple(bands), *tables)
 
 
 def ordered(rows: Rows, order: np.ndarray, *, turns: bool = True) -> Rows:
@@ -93,23 +96,23 @@ def ordered(rows: Rows, order: np.ndarray, *, turns: bool = True) -> Rows:
       order: indices [N].
       turns: turn splats by half if that makes their rotations smaller; otherwise only make w positive.
     """
-    quats = rows.quats[order]
-    quats, axis = nearest_half_turn(quats) if turns else (with_positive_w(quats), np.zeros(len(order), np.int64))
-    degrees, bands = rows.degrees[order], []
+    quats = with_positive_w(rows.quats[order])
+    axis = np.zeros(len(order), np.int64)
+    if turns:
+        quats, axis = nearest_half_turn(rows.quats[order])
+    degrees = rows.degrees[order]
+    bands = []
     for degree, band in enumerate(rows.bands):  # The n-th splat of that degree or more has the n-th row.
         places = np.cumsum(rows.degrees >= degree) - 1
         bands.append(band[places[order[degrees >= degree]]])
-    return Rows(
-        means=rows.means[order],
-        quats=quats,
-        log_scales=rows.log_scales[order],
-        logit_opacities=rows.logit_opacities[order],
-        degrees=degrees,
-        bands=tuple(bands),
-        sizes=None if rows.sizes is None else rows.sizes[order],
-        texels=None if rows.texels is None or rows.sizes is None else rows.texels[_texels(rows.sizes, order, axis)],
-        shapes=None if rows.shapes is None else rows.shapes[order],
-    )
+    sizes = texels = shapes = None
+    if rows.sizes is not None and rows.texels is not None:
+        sizes = rows.sizes[order]
+        texels = rows.texels[_texels(rows.sizes, order, axis)]
+    if rows.shapes is not None:
+        shapes = rows.shapes[order]
+    columns = (rows.means[order], quats, rows.log_scales[order], rows.logit_opacities[order])
+    return Rows(*columns, degrees, tuple(bands), sizes, texels, shapes)
 
 
 def joined_rows(parts: Sequence[Rows]) -> Rows:
@@ -118,7 +121,10 @@ def joined_rows(parts: Sequence[Rows]) -> Rows:
         return parts[0]
     values = {field.name: [getattr(part, field.name) for part in parts] for field in dataclasses.fields(Rows)}
     bands = tuple(map(np.concatenate, zip(*values.pop("bands"), strict=True)))
-    tables: dict[str, Any] = {name: None if rows[0] is None else np.concatenate(rows) for name, rows in values.items()}
+    tables: dict[str, Any] = dict.fromkeys(values)
+    for name, rows in values.items():
+        if rows[0] is not None:
+            tables[name] = np.concatenate(rows)
     return Rows(bands=bands, **tables)
 
 

@@ -12,10 +12,12 @@ import os
 import string
 import warnings
 from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from a2tg_jax.appearance.base import check_appearance
@@ -30,7 +32,7 @@ from a2tg_jax.host.atomic import write_whole
 from a2tg_jax.host.text import counted, first_names, shortened
 from a2tg_jax.io.columns import morton
 from a2tg_jax.io.model_file import origin_arrays, origin_header
-from a2tg_jax.io.validate import LARGEST_LOG_SCALE, check_model, check_origin
+from a2tg_jax.io.validate import LARGEST_LOG_SCALE, check_model, check_origin, existing_bytes, reading
 from a2tg_jax.model import Model, concatenate
 
 Up = Literal["y", "z"]
@@ -47,7 +49,8 @@ UPRIGHT: Mapping[Up, np.ndarray] = {
 UNMOVED = Similarity(1.0, np.eye(3), np.zeros(3))
 LEVEL = math.cos(math.radians(3))
 """Cosine of the largest angle between the estimated vertical and an axis that counts as the vertical itself."""
-LEAST_SCALE, LEAST_OPACITY = 1e-30, 1e-6
+LEAST_SCALE = 1e-30
+LEAST_OPACITY = 1e-6
 FILTER = "filter_3D"
 """Name of the widths of Mip-Splatting's filter, in PLY files and checkpoints."""
 LEAST_LENGTH = 1e-9
@@ -84,6 +87,11 @@ class Ellipsoids(NamedTuple):
     sh: np.ndarray
     """[N, K, 3] coefficients, as in `Gaussians`."""
 
+    @staticmethod
+    def of(*columns: ArrayLike) -> "Ellipsoids":
+        """Return the ellipsoids of five columns, rounded to float32."""
+        return Ellipsoids(*(np.asarray(column, np.float32) for column in columns))
+
 
 class WorldGaussians(NamedTuple):
     """Plain Gaussians in the world of a file."""
@@ -110,7 +118,8 @@ def plain_gaussians(gaussians: Gaussians | Model, *, keeps_shapes: bool = False)
     if isinstance(gaussians, Model):
         model = gaussians.live
         check_appearance(model.appearance, model.gaussians)
-        gaussians, shown = dataclasses.replace(model.gaussians, sh=jnp.asarray(model.sh)), model.appearance
+        shown = model.appearance
+        gaussians = dataclasses.replace(model.gaussians, sh=jnp.asarray(model.sh))
         if shown.shapes is not None and not keeps_shapes:
             gaussians = nearest_gaussians(gaussians, np.asarray(shown.shapes))
         if not shown.has_own_opacities:
@@ -137,13 +146,13 @@ def world_gaussians(
     if not np.array_equal(turn, np.eye(3)):
         to_world = to_world.then(Similarity(1.0, turn, np.zeros(3)))
     means = to_world.apply(np.asarray(plain.means, np.float64))
-    offset = offset_for(kind, means, np.asarray(plain.log_scales, np.float64) + np.log(to_world.scale))
-    if offset.any():
-        # The offset goes before means are rounded to float32.
-        to_world = dataclasses.replace(to_world, translation=to_world.translation - offset)
+    offset = offset_after(kind, plain, to_world)
     # Without a move nothing is computed, so that nothing is rounded.
-    moved = plain if transform is None and not offset.any() else transform_gaussians(plain, to_world)
-    return WorldGaussians(moved, offset, means, turn)
+    if transform is not None or offset.any():
+        # The offset is subtracted before means are rounded to float32.
+        to_world = dataclasses.replace(to_world, translation=to_world.translation - offset)
+        plain = transform_gaussians(plain, to_world)
+    return WorldGaussians(plain, offset, means, turn)
 
 
 def upright_turn(model: Model) -> np.ndarray:
@@ -167,9 +176,7 @@ def has_map_coordinates(model: Model) -> bool:
     """Return whether float32 would round a model's positions in its original world too far."""
     if model.origin is None:
         return False
-    to_world, gaussians = model.origin.transform.inverse(), model.live.gaussians
-    log_scales = np.asarray(gaussians.log_scales, np.float64) + np.log(to_world.scale)
-    return bool(offset_for("ply", to_world.apply(np.asarray(gaussians.means, np.float64)), log_scales).any())
+    return bool(offset_after("ply", model.live.gaussians, model.origin.transform.inverse()).any())
 
 
 def world_line(model: Model, world: World) -> str:
@@ -201,8 +208,7 @@ def splats_of(model: Model, *, keeps_shapes: bool = False) -> Ellipsoids:
     scales = np.exp(np.concatenate([log_scales, third_log_scales(log_scales)], axis=1))
     # Coefficients above every splat's degree are zeros.
     sh = gaussians.sh[:, : NUM_BASES[model.degrees.max(initial=0)]]
-    numbers = (gaussians.means, units, scales, 1 / (1 + np.exp(-logits)), sh)
-    return Ellipsoids(*(np.asarray(values, np.float32) for values in numbers))
+    return Ellipsoids.of(gaussians.means, units, scales, 1 / (1 + np.exp(-logits)), sh)
 
 
 def third_log_scales(log_scales: np.ndarray) -> np.ndarray:
@@ -229,7 +235,8 @@ def writer_as(kind: Kind, encode: Callable[[PlacedSplats], bytes]) -> Callable[.
     """
 
     def save(path: str | os.PathLike[str], model: Gaussians | Model, *, world: World = "original") -> None:
-        gaussians, offset, _, turn = world_gaussians(model, kind=kind, world=world)
+        placed = world_gaussians(model, kind=kind, world=world)
+        gaussians = placed.gaussians
         if not gaussians.num:
             raise ValueError(f"{path}: the model has no Gaussians; a file of this format has at least one")
         check_model(Model(gaussians))  # Never write a file that would not load.
@@ -243,10 +250,41 @@ def writer_as(kind: Kind, encode: Callable[[PlacedSplats], bytes]) -> Callable[.
         splats = splats_of(Model(gaussians[np.argsort(morton(codes.T, CURVE_BITS), kind="stable")]))
         # Formats that round scales by a table then spend one entry on the third.
         splats.scales[:, 2] = max(splats.scales[:, 2].min(), LEAST_THIRD_SCALE)
-        write_whole(path, encode(PlacedSplats(splats, offset, turn)))
-        warn_of_offset(kind, offset, path)
+        write_whole(path, encode(PlacedSplats(splats, placed.offset, placed.turn)))
+        warn_of_offset(kind, placed.offset, path)
 
     return save
+
+
+def reader_of(decode: Callable[[bytes, Path], Model]) -> Callable[[Path], Model]:
+    """Return a function that reads a file by a function of its bytes and its path.
+
+    It raises FileNotFoundError if there is no such file; a ValueError names the file.
+    """
+
+    def load(path: Path) -> Model:
+        data = existing_bytes(path, "file")
+        with reading(path):
+            return decode(data, path)
+
+    return load
+
+
+def pack_bits(columns: Iterable[np.ndarray], bits: tuple[int, ...]) -> np.ndarray:
+    """Return columns of unsigned integers of these bits packed into one of 32 bits, the first highest."""
+    packed: Any = np.uint32(0)
+    for column, num in zip(columns, bits, strict=True):
+        packed = packed << np.uint32(num) | column.astype(np.uint32)
+    return np.asarray(packed, "<u4")
+
+
+def unpack_bits(packed: np.ndarray, bits: tuple[int, ...]) -> list[np.ndarray]:
+    """Return the columns that `pack_bits` was given."""
+    columns = []
+    for num in reversed(bits):
+        columns.append(packed & np.uint32((1 << num) - 1))
+        packed = packed >> np.uint32(num)
+    return columns[::-1]
 
 
 def without_largest(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -287,11 +325,12 @@ def gaussians_of(
     """
     # A covariance has the squares of the scales, whatever their signs.
     log_scales = np.log(np.maximum(np.abs(splats.scales), LEAST_SCALE))
+    if is_flat:
+        log_scales = log_scales[:, :2]
     opacities = np.clip(splats.opacities.astype(np.float64), LEAST_OPACITY, LARGEST_OPACITY)
-    numbers = (splats.means, splats.quats, log_scales[:, :2] if is_flat else log_scales)
     logits = np.log(opacities) - np.log1p(-opacities)
-    columns = flat_rows(os.fspath(path), *numbers, logits, splats.sh, keeps_all=keeps_all)
-    return Gaussians(*(jnp.asarray(values, jnp.float32) for values in columns))
+    rows = FileRows(splats.means, splats.quats, log_scales, logits, splats.sh)
+    return flat_rows(os.fspath(path), rows, keeps_all=keeps_all).gaussians
 
 
 def model_of_splats(
@@ -303,22 +342,30 @@ def model_of_splats(
     return model
 
 
-def flat_rows(
-    name: str,
-    means: np.ndarray,
-    quats: np.ndarray,
-    log_scales: np.ndarray,
-    logits: np.ndarray,
-    sh: np.ndarray,
-    *,
-    keeps_all: bool = False,
-) -> tuple[np.ndarray, ...]:
-    """Return the columns with rows that can be drawn only, unless it `keeps_all`, and two log-scales.
+class FileRows(NamedTuple):
+    """Numbers of N Gaussians in a file, of any type of floats."""
+
+    means: np.ndarray
+    quats: np.ndarray
+    log_scales: np.ndarray
+    """[N, 2], or [N, 3] of ellipsoids."""
+    logits: np.ndarray
+    sh: np.ndarray
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """The same as float32; numbers that are too large for it become infinite, which fails the checks of a model."""
+        with np.errstate(over="ignore"):
+            return Gaussians(*(jnp.asarray(np.asarray(column, np.float32)) for column in self))
+
+
+def flat_rows(name: str, rows: FileRows, *, keeps_all: bool = False) -> FileRows:
+    """Return the rows that can be drawn, or all of them if it `keeps_all`, with two log-scales.
 
     Three log-scales are `flattened`. Quaternions of zeros become unrotated, as the renderer draws them, with a warning;
     infinite logits become finite.
     """
-    quats = np.array(quats)
+    quats = np.array(rows.quats)
     lengths = np.linalg.norm(quats.astype(np.float64), axis=1)
     unrotated = np.flatnonzero(lengths == 0)
     if len(unrotated):
@@ -327,52 +374,52 @@ def flat_rows(
             f"unrotated; the first is row {unrotated[0]:,} (from 0)"
         )
         warnings.warn(message, stacklevel=4)
-        quats[unrotated] = 1, 0, 0, 0
+        quats[unrotated] = [1, 0, 0, 0]
     # The squares of these leave the range of float32.
     is_extreme = ((lengths > 0) & (lengths < LEAST_LENGTH)) | (np.isfinite(lengths) & (lengths > 1 / LEAST_LENGTH))
     quats[is_extreme] /= lengths[is_extreme, None]
     # Some programs write infinite logits for opacities 0 and 1.
-    most = np.where(logits > 0, -np.log(LEAST_OPACITY), np.log(LEAST_OPACITY)).astype(logits.dtype)
-    logits = np.where(np.isinf(logits), most, logits)
+    most = np.copysign(np.log(LEAST_OPACITY), rows.logits).astype(rows.logits.dtype)
+    rows = rows._replace(quats=quats, logits=np.where(np.isinf(rows.logits), most, rows.logits))
     if not keeps_all:
-        columns = {"means": means, "quats": quats, "log-scales": log_scales, "logits": logits, "SH": sh}
-        kept = drawable_rows(name, columns)
-        means, quats, log_scales, logits, sh = (values[kept] for values in columns.values())
-    if log_scales.shape[1] == 3:
-        quats, log_scales = flattened(quats, log_scales, name)
-    return means, quats, log_scales, logits, sh
+        is_drawable = drawable_rows(name, rows)
+        rows = FileRows(*(column[is_drawable] for column in rows))
+    if rows.log_scales.shape[1] == 3:
+        quats, log_scales = flattened(rows.quats, rows.log_scales, name)
+        rows = rows._replace(quats=quats, log_scales=log_scales)
+    return rows
 
 
-def drawable_rows(name: str, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+def drawable_rows(name: str, rows: FileRows) -> np.ndarray:
     """Return which rows [N] have finite numbers that float32 can draw. The others are counted in a warning that names
     the file and the first of them.
 
     If there are none, all are returned, and the checks of a model fail. Of three log-scales the smallest may be −inf:
     `flattened` drops it.
     """
-    seen = {}
-    is_good = {}
-    for field, values in columns.items():
-        is_scale = field == "log-scales"
-        # NaN is sorted to the end.
-        seen[field] = np.sort(values, axis=1)[:, -2:] if is_scale else values
+    # NaN is sorted to the end.
+    checked = rows._replace(log_scales=np.sort(rows.log_scales, axis=1)[:, -2:])
+    num = len(rows.means)
+    is_drawable = np.ones(num, bool)
+    first = num
+    what = ""
+    for field, column in checked._asdict().items():
+        numbers = column.reshape(num, math.prod(column.shape[1:]))
         # False for NaN.
-        is_good[field] = (seen[field] <= (LARGEST_LOG_SCALE if is_scale else LARGEST_NUMBER)) & (
-            seen[field] >= -LARGEST_NUMBER
-        )
-    in_rows = [good.all(axis=tuple(range(1, good.ndim))) for good in is_good.values()]
-    is_drawable: np.ndarray = np.logical_and.reduce(in_rows)
-    bad = np.flatnonzero(~is_drawable)
-    if len(bad) == len(is_drawable):
-        return np.ones(len(bad), bool)
-    if len(bad):
-        row = bad[0]
-        field = next(field for field, good in is_good.items() if not good[row].all())
-        number = np.atleast_1d(seen[field][row])[~np.atleast_1d(is_good[field][row])][0]
+        is_good = numbers <= (LARGEST_LOG_SCALE if field == "log_scales" else LARGEST_NUMBER)
+        is_good &= numbers >= -LARGEST_NUMBER
+        bad = np.flatnonzero(~is_good.all(axis=1))
+        is_drawable[bad] = False
+        if len(bad) and bad[0] < first:
+            first = bad[0]
+            what = f"{field} of {numbers[first][~is_good[first]][0]:g}"
+    if not is_drawable.any():
+        return np.ones(num, bool)
+    if what:
         message = (
-            f"{name}: {counted(len(bad), 'Gaussian')} of {len(is_drawable):,} left out, with numbers that are NaN, "
-            f"infinite or too large to draw (beyond ±{LARGEST_NUMBER:g}); the first is row {row:,} (from 0), with "
-            f"{field} of {number:g}"
+            f"{name}: {counted(num - int(is_drawable.sum()), 'Gaussian')} of {num:,} left out, with numbers that are "
+            f"NaN, infinite or too large to draw (beyond ±{LARGEST_NUMBER:g}); the first is row {first:,} (from 0), "
+            f"with {what}"
         )
         warnings.warn(message, stacklevel=5)
     return is_drawable
@@ -403,7 +450,8 @@ def flattened(quats: np.ndarray, log_scales: np.ndarray, name: str) -> tuple[np.
     """
     if len(log_scales):
         # In a file that rounds scales, all flat Gaussians have one third scale, its smallest; most are far wider.
-        others, third = log_scales[:, :2], log_scales[:, 2]
+        others = log_scales[:, :2]
+        third = log_scales[:, 2]
         if third.min() == third.max() <= others.min() and third[0] < np.median(others) + np.log(0.1):
             return quats, others
     thinnest = 2 - np.argmin(log_scales[:, ::-1], axis=1)  # The last of equal ones.
@@ -416,7 +464,8 @@ def flattened(quats: np.ndarray, log_scales: np.ndarray, name: str) -> tuple[np.
         message = f"{name}: holds 3D Gaussians (scale_2), {num_thick} of them not flat; their thinnest axis is dropped"
         warnings.warn(message, stacklevel=4)
     # The product of quaternions: the turn of the axes first, then the splat's own rotation.
-    (w, x, y, z), (a, b, c, d) = quats.T, AXES_TO_NORMAL[thinnest].T
+    w, x, y, z = quats.T
+    a, b, c, d = AXES_TO_NORMAL[thinnest].T
     product = (
         w * a - x * b - y * c - z * d,
         w * b + x * a + y * d - z * c,
@@ -429,11 +478,11 @@ def flattened(quats: np.ndarray, log_scales: np.ndarray, name: str) -> tuple[np.
 def warn_of_unread(names: Iterable[str], path: str | os.PathLike[str]) -> None:
     """Warn of the attributes of a file's Gaussians that are not read, unless there are none; f_rest_* is read."""
     # Many names differ in a number only, and f_offset_9 comes before f_offset_10.
-    by_stem = collections.defaultdict(list)
+    by_stem: dict[str, list[str]] = collections.defaultdict(list)
     for name in sorted(names, key=lambda name: (len(name), name)):
         by_stem[name.rstrip(string.digits)].append(shortened(name))
     by_stem.pop("f_rest_", None)
-    kinds = [own[0] if len(own) == 1 else f"{own[0]} to {own[-1]}" for own in by_stem.values()]
+    kinds = [alike[0] if len(alike) == 1 else f"{alike[0]} to {alike[-1]}" for alike in by_stem.values()]
     if kinds:
         message = (
             f"{os.fspath(path)}: does not read {first_names(kinds)}; if the program that "
@@ -461,9 +510,11 @@ def upright(origin: Origin | Similarity | None, up: Up) -> Similarity:
     """
     if isinstance(origin, Similarity):
         return Similarity(1.0 / float(origin.scale), UPRIGHT[up], np.zeros(3))
-    vertical, scale = np.array([0.0, -1.0, 0.0]), 1.0
+    vertical = np.array([0.0, -1.0, 0.0])
+    scale = 1.0
     if origin is not None:
-        vertical, scale = origin.transform.rotation @ _vertical_of_files(origin), 1.0 / float(origin.transform.scale)
+        vertical = origin.transform.rotation @ _vertical_of_files(origin)
+        scale = 1.0 / float(origin.transform.scale)
     turn = UPRIGHT[up] @ upright_rotation(np.array([0.0, 0.0, 1.0])).T @ upright_rotation(vertical)
     return Similarity(scale, turn, np.zeros(3))
 
@@ -503,7 +554,7 @@ def joined_parts(parts: Iterable[tuple[Model, np.ndarray]], up: Up) -> Model:
       parts: models as the file holds them, and the matrices from there to the world of the file.
       up: the axis that is up there.
     """
-    placed, is_known, offset, models = UNMOVED, True, None, list[Model]()
+    models: list[Model] = []
     for model, matrix in parts:
         # A file may refer to one mesh from any number of nodes.
         if len(models) == MOST_PARTS:
@@ -514,26 +565,27 @@ def joined_parts(parts: Iterable[tuple[Model, np.ndarray]], up: Up) -> Model:
             # In files of version 0.2 and of other programs, +z of the model is up.
             earlier = Similarity(placed.scale, UPRIGHT[up], np.zeros(3))
             is_known = model.origin is not None or _is_same(world, placed)
-            placed = earlier if not is_known or _is_same(world, earlier) else placed
+            if not is_known or _is_same(world, earlier):
+                placed = earlier
         move = world.then(placed.inverse())
         # A file written here must come back with the same numbers: rounding in its matrix must not move it.
-        if is_same := _is_same(move, UNMOVED):
+        is_same = _is_same(move, UNMOVED)
+        if is_same:
             move = UNMOVED
         check_similarity(move, "its transform")
         # One offset for all parts, by the first: they must share a world.
-        if offset is None:
-            means, log_scales = np.asarray(model.gaussians.means, np.float64), np.asarray(model.gaussians.log_scales)
-            offset = offset_for("ply", move.apply(means), log_scales + np.log(move.scale))
-        if offset.any():
-            move = dataclasses.replace(move, translation=move.translation - offset)
-        models.append(model if is_same and not offset.any() else model.transform(move))
-    if not models or offset is None:
+        if not models:
+            offset = offset_after("ply", model.gaussians, move)
+        if not is_same or offset.any():
+            model = model.transform(dataclasses.replace(move, translation=move.translation - offset))
+        models.append(model)
+    if not models:
         raise ValueError("holds no splats")
     if models[0].origin is None:
-        found = origin_at(offset)
+        origin = origin_at(offset)
         if not is_known:
-            found = dataclasses.replace(found or Origin.of_cameras([]), up=np.array([0.0, 0.0, 1.0]))
-        models[0] = dataclasses.replace(models[0], origin=found)
+            origin = dataclasses.replace(origin or Origin.of_cameras([]), up=np.array([0.0, 0.0, 1.0]))
+        models[0] = dataclasses.replace(models[0], origin=origin)
     return models[0] if len(models) == 1 else concatenate(models)
 
 
@@ -576,6 +628,12 @@ OFFSET_PLACES = {
 """Where a file has the offset of its positions, by the name of its format."""
 
 
+def offset_after(kind: Kind, gaussians: Gaussians, move: Similarity) -> np.ndarray:
+    """Return the offset of `offset_for` for Gaussians that a move takes to the original world."""
+    means = move.apply(np.asarray(gaussians.means, np.float64))
+    return offset_for(kind, means, np.asarray(gaussians.log_scales, np.float64) + np.log(move.scale))
+
+
 def offset_for(kind: Kind, means: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
     """Return whole numbers [3] to subtract from positions [N, 3] so that a format can hold them; zeros if it can.
 
@@ -594,7 +652,8 @@ def offset_for(kind: Kind, means: np.ndarray, log_scales: np.ndarray) -> np.ndar
         # Whole numbers are exact in float64 and short in text; the median ignores floaters.
         offset: np.ndarray = np.rint(np.median(means, axis=0)) + 0.0  # Not -0.0.
         scales = np.exp(np.asarray(log_scales, np.float64).mean(axis=1))
-        before, after = excess(means), excess(means - offset)
+        before = excess(means)
+        after = excess(means - offset)
         is_outside = kind == "spz" and bool(np.abs(means).max() > SPZ_REACH)
     # An offset must at least halve the rounding to be worth a moved origin.
     return offset if is_outside or (before > 1 and after < before / 2) else np.zeros(3)
@@ -665,7 +724,8 @@ def cut_numbers(name: str, model: Model) -> list[str]:
     if name not in RANGES:
         return []
     gaussians = world_gaussians(model).gaussians
-    (first, rest, low, high), sizes = RANGES[name], np.abs(np.asarray(gaussians.sh))
+    first, rest, low, high = RANGES[name]
+    sizes = np.abs(np.asarray(gaussians.sh))
     # It has no higher degrees to cut.
     if name == ".splat":
         sizes = sizes[:, :1]

@@ -7,10 +7,12 @@ import jax.numpy as jnp
 
 from a2tg_jax.core.cameras import Camera, check_calibration, check_camera
 from a2tg_jax.host.text import shortened
-from a2tg_jax.io.saved_file import load_saved, numbers_of
+from a2tg_jax.io.saved_file import load_saved
+from a2tg_jax.io.validate import numbers_of
 
 # A file may come from a stranger: sides decide how much memory a frame takes.
-LARGEST_SIDE, MOST_VIEWS = 16384, 10_000
+LARGEST_SIDE = 16384
+MOST_VIEWS = 10_000
 
 
 def load_views(path: Path) -> list[Camera]:

@@ -20,7 +20,6 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.lib.recfunctions import append_fields
 from scipy.spatial.transform import Rotation
@@ -31,14 +30,37 @@ from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.data.other_runs import model_hint
 from a2tg_jax.data.ply import OFFSET, RGB, ROTATION, SH_DEGREE0, PlyFile, largest_color
 from a2tg_jax.host.atomic import write_whole
-from a2tg_jax.host.regular_files import expanded, is_regular, open_regular
-from a2tg_jax.io import other_programs as others
-from a2tg_jax.io.validate import check_model, check_suffix, reading
+from a2tg_jax.host.regular_files import expanded, open_regular
+from a2tg_jax.io.columns import logits_of
+from a2tg_jax.io.other_programs import (
+    FILTER,
+    LEAST_OPACITY,
+    FileRows,
+    PlacedSplats,
+    World,
+    degree_to_read,
+    filtered,
+    flat_rows,
+    number_words,
+    offset_for,
+    origin_at,
+    pack_bits,
+    third_log_scales,
+    unpack_bits,
+    warn_of_offset,
+    warn_of_unread,
+    with_largest,
+    without_largest,
+    world_gaussians,
+)
+from a2tg_jax.io.validate import check_exists, check_model, check_suffix, reading
 from a2tg_jax.model import Model
 
-MEANS, NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
+MEANS = ("x", "y", "z")
+NORMALS = ("nx", "ny", "nz")
 SH_REST = tuple(f"f_rest_{i}" for i in range(45))
-SCALES, QUATS = ("scale_0", "scale_1"), tuple(f"rot_{i}" for i in range(4))
+SCALES = ("scale_0", "scale_1")
+QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 ATTRIBUTES = (*MEANS, *NORMALS, *SH_DEGREE0, *SH_REST, "opacity", *SCALES, *QUATS)
 NUM_REST = (0, 9, 24, 45, 72)
 """Number of attributes f_rest_* by degree of the spherical harmonics; some programs write degree 4."""
@@ -58,7 +80,7 @@ def save_ply(
     *,
     third_scale: bool = True,
     float64: bool = False,
-    world: others.World = "original",
+    world: World = "original",
 ) -> None:
     """Write Gaussians with the attributes of 2DGS, normals along the splats' own, and a third scale.
 
@@ -88,11 +110,12 @@ def save_ply(
     """
     check_suffix(path, "save_ply")
     path = expanded(path)
-    found = others.world_gaussians(gaussians, transform, world=world)
-    third = others.third_log_scales(np.asarray(found.gaussians.log_scales)) if third_scale else None
-    means, offset = (found.means, np.zeros(3)) if float64 else (None, found.offset)
-    write_whole(path, encode_ply(found.gaussians, third, place_comments(offset, found.turn), means))
-    others.warn_of_offset("ply", offset, path)
+    placed = world_gaussians(gaussians, transform, world=world)
+    third = third_log_scales(np.asarray(placed.gaussians.log_scales)) if third_scale else None
+    offset = np.zeros(3) if float64 else placed.offset
+    comments = place_comments(offset, placed.turn)
+    write_whole(path, encode_ply(placed.gaussians, third, comments, placed.means if float64 else None))
+    warn_of_offset("ply", offset, path)
 
 
 def encode_ply(
@@ -108,7 +131,8 @@ def encode_ply(
     """
     # Never write a file that `load_ply` rejects.
     check_model(Model(gaussians))
-    sh, log_scales = np.asarray(gaussians.sh), np.asarray(gaussians.log_scales)
+    sh = np.asarray(gaussians.sh)
+    log_scales = np.asarray(gaussians.log_scales)
     # [N, K, 3] to channel by channel, as 3DGS writes f_rest.
     rest = sh[:, 1:].transpose(0, 2, 1).reshape(gaussians.num, 3 * (sh.shape[1] - 1))
     names = [name for name in ATTRIBUTES if name not in SH_REST[rest.shape[1] :]]
@@ -124,14 +148,23 @@ def encode_ply(
         log_scales,
         np.asarray(gaussians.quats),
     ]
-    kind, positions = ("float", np.asarray(gaussians.means, "<f4")) if means is None else ("double", means)
-    properties = "".join(f"property {kind if name in MEANS else 'float'} {name}\n" for name in names)
-    comments = f"comment {FLAT_MARK}\n{comments}"
-    header = f"ply\nformat binary_little_endian 1.0\n{comments}element vertex {gaussians.num}\n{properties}end_header\n"
-    parts = (positions.astype(positions.dtype.newbyteorder("<")), np.concatenate(columns, 1).astype("<f4"))
+    kind = "float" if means is None else "double"
+    properties = [(kind if name in MEANS else "float", name) for name in names]
+    positions = np.asarray(gaussians.means, "<f4") if means is None else np.asarray(means, "<f8")
+    parts = (positions, np.concatenate(columns, axis=1).astype("<f4"))
     # As bytes, since float64 positions and float32 columns share a row.
     rows = np.concatenate([np.ascontiguousarray(part).view(np.uint8) for part in parts], axis=1)
-    return header.encode("ascii") + rows.tobytes()
+    return _header(comments, [("vertex", gaussians.num, properties)]) + rows.tobytes()
+
+
+def _header(comments: str, elements: Iterable[tuple[str, int, Iterable[tuple[str, str]]]]) -> bytes:
+    """Return the header of a file of flat splats, given name, number of rows, and types and names of the properties of
+    each element."""
+    lines = ["ply", "format binary_little_endian 1.0", f"comment {FLAT_MARK}", *comments.splitlines()]
+    for element, num, properties in elements:
+        lines.append(f"element {element} {num}")
+        lines += [f"property {kind} {name}" for kind, name in properties]
+    return "\n".join([*lines, "end_header\n"]).encode("ascii")
 
 
 def place_marks(offset: np.ndarray, turn: np.ndarray) -> dict[str, np.ndarray]:
@@ -146,7 +179,7 @@ def place_marks(offset: np.ndarray, turn: np.ndarray) -> dict[str, np.ndarray]:
 def place_comments(offset: np.ndarray, turn: np.ndarray) -> str:
     """Return `place_marks` as header lines."""
     marks = place_marks(offset, turn).items()
-    return "".join(f"comment {word} {' '.join(others.number_words(numbers))}\n" for word, numbers in marks)
+    return "".join(f"comment {word} {' '.join(number_words(numbers))}\n" for word, numbers in marks)
 
 
 def load_ply(path: str | os.PathLike[str]) -> Gaussians:
@@ -158,10 +191,10 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
     Text and binary files of either byte order are read, and colours red, green, blue where f_dc_* are missing. SH
     keep the file's degree. Degrees above 3 are dropped with a warning, and so are Gaussians with numbers that are not
     finite or too large to draw. filter_3D of Mip-Splatting widens the scales and lowers the opacities, as that program
-    draws them; a warning names other attributes, but for normals and further colours.
+    draws them. A warning names other attributes that are not read, except normals and additional colours.
     The third scale (scale_2) of a file that marks its splats as flat is dropped. Other files have ellipsoids: the
     thinnest axis of each becomes the normal and its scale is dropped, with a warning if that is more than a thousandth
-    of the others.
+    of the
 
     Args:
       path: the file.
@@ -181,7 +214,7 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
     check_suffix(path, "load_ply")
     model = load_ply_model(path)
     if model.origin is not None and model.origin.transform.translation.any():
-        offset = ", ".join(others.number_words(-model.origin.transform.translation))
+        offset = ", ".join(number_words(-model.origin.transform.translation))
         warnings.warn(f"{path}: positions are relative to ({offset}); load_splats keeps this offset", stacklevel=2)
     return model.gaussians
 
@@ -189,8 +222,7 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
 def load_ply_model(path: str | os.PathLike[str]) -> Model:
     """Return the Gaussians of `load_ply` as a model, with the offset of the positions, if any, in its origin."""
     path = expanded(path)
-    if not is_regular(path):
-        raise FileNotFoundError(f"{path}: no such PLY file{model_hint(path)}")
+    check_exists(path, f"PLY file{model_hint(path)}")
     with open_regular(path) as file:
         return decode_ply(file, path)
 
@@ -204,22 +236,20 @@ def decode_ply(file: BinaryIO, path: Path, *, is_flat: bool = False) -> Model:
     # A packed file begins with its chunks.
     vertices = unpacked_vertices(ply) if [*ply.counts][:1] == ["chunk"] else _vertices(ply)
     is_flat |= any(" ".join(words).lower() == FLAT_MARK.lower() for words in ply.comments)
-    has_third = THIRD_SCALE in (vertices.dtype.names or ()) and not is_flat
-    log_scales = _columns(vertices, (*SCALES, THIRD_SCALE) if has_third else SCALES)
-    # float64 until the offset is subtracted: float32 would round map coordinates.
-    means, quats = np.stack([vertices[name].astype(np.float64) for name in MEANS], axis=-1), _columns(vertices, QUATS)
+    names = vertices.dtype.names or ()
+    log_scales = _columns(vertices, SCALES if is_flat or THIRD_SCALE not in names else (*SCALES, THIRD_SCALE))
     logits = _columns(vertices, ("opacity",))[:, 0]
-    if others.FILTER in (vertices.dtype.names or ()):
-        log_scales, logits = others.filtered(log_scales, logits, vertices[others.FILTER])
-    sh = _sh_of(vertices, path)
-    means, quats, log_scales, logits, sh = others.flat_rows(str(path), means, quats, log_scales, logits, sh)
-    inside = others.offset_for("ply", means, log_scales)  # Zeros where the file has float32.
-    with np.errstate(over="ignore"):  # What is too large becomes infinite, which fails the checks.
-        means = (means - inside).astype(np.float32)
-    gaussians = Gaussians(*(jnp.asarray(rows) for rows in (means, quats, log_scales, logits, sh)))
+    if FILTER in names:
+        log_scales, logits = filtered(log_scales, logits, vertices[FILTER])
+    # float64 until the offset is subtracted: float32 would round map coordinates.
+    means = np.stack([vertices[name].astype(np.float64) for name in MEANS], axis=-1)
+    rows = FileRows(means, _columns(vertices, QUATS), log_scales, logits, _sh_of(vertices, path))
+    rows = flat_rows(str(path), rows)
+    inside = offset_for("ply", rows.means, rows.log_scales)  # Zeros where the file has float32.
+    gaussians = rows._replace(means=rows.means - inside).gaussians
     with reading(path):
         check_model(Model(gaussians))
-        return Model(gaussians, origin=others.origin_at(inside + ply.offset, ply.turn))
+        return Model(gaussians, origin=origin_at(inside + ply.offset, ply.turn))
 
 
 def _vertices(ply: PlyFile) -> np.ndarray:
@@ -231,7 +261,7 @@ def _vertices(ply: PlyFile) -> np.ndarray:
     of_networks = "; its networks make splats of these anchors: export them" if ANCHORS in fields else ""
     ply.require_vertices(wanted, f"a PLY of Gaussians{of_networks}")
     vertices = ply.read("vertex")
-    others.warn_of_unread({*fields} - {*wanted, THIRD_SCALE, others.FILTER, *UNSEEN}, ply.path)
+    warn_of_unread({*fields} - {*wanted, THIRD_SCALE, FILTER, *UNSEEN}, ply.path)
     if not has_colors:
         return vertices
     colors = np.stack([vertices[name].astype(np.float64) for name in RGB], axis=1)
@@ -242,12 +272,12 @@ def _vertices(ply: PlyFile) -> np.ndarray:
 
 def _sh_of(vertices: np.ndarray, path: Path) -> np.ndarray:
     """Return the spherical harmonics [N, K, 3] of a structured array of vertices."""
-    found = {name for name in vertices.dtype.names or () if name.startswith("f_rest_")}
-    rest = [f"f_rest_{i}" for i in range(len(found))]
+    names = {name for name in vertices.dtype.names or () if name.startswith("f_rest_")}
+    rest = [f"f_rest_{i}" for i in range(len(names))]
     # Gaps in the numbering would shift the channels.
-    if len(rest) not in NUM_REST or found != set(rest):
+    if len(rest) not in NUM_REST or names != set(rest):
         raise ValueError(f"{path}: has {len(rest)} attributes f_rest_*; SH of degree 0 to 4 have 0, 9, 24, 45 or 72")
-    num_bases = NUM_BASES[others.degree_to_read(NUM_REST.index(len(rest)), str(path))]
+    num_bases = NUM_BASES[degree_to_read(NUM_REST.index(len(rest)), str(path))]
     sh = np.zeros((len(vertices), num_bases, 3), np.float32)
     sh[:, 0] = _columns(vertices, SH_DEGREE0)
     if rest:
@@ -266,9 +296,13 @@ def _columns(vertices: np.ndarray, wanted: Iterable[str]) -> np.ndarray:
 # Files that SuperSplat packed
 
 CHUNK = 256
-AXES, CHANNELS = "xyz", "rgb"
-BOUNDS = tuple(f"{end}_{what}{axis}" for what in ("", "scale_") for end in ("min", "max") for axis in AXES)
+AXES = "xyz"
+CHANNELS = "rgb"
+BOUNDS = tuple(f"{end}_{axis}" for end in ("min", "max", "min_scale", "max_scale") for axis in AXES)
 COLOR_BOUNDS = tuple(f"{end}_{channel}" for end in ("min", "max") for channel in CHANNELS)
+THREE_BITS = (11, 10, 11)
+QUAT_BITS = (2, 10, 10, 10)
+COLOR_BITS = (8, 8, 8, 8)
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 SH_RANGE = 8.0
 """Range of the coefficients that a byte encodes."""
@@ -276,14 +310,16 @@ SH_RANGE = 8.0
 
 def unpacked_vertices(ply: PlyFile) -> np.ndarray:
     """Return the vertices of a packed PLY, structured, with the attribute names of 3DGS; float32."""
-    path, names = ply.path, list(ply.counts)
+    path = ply.path
+    names = list(ply.counts)
     if names not in (["chunk", "vertex"], ["chunk", "vertex", "sh"]):
         raise ValueError(f"{path}: a packed PLY has the elements chunk, vertex and sh; this one has {names}")
     if ply.encoding != "binary_little_endian":
         raise ValueError(f"{path}: is a packed PLY in {ply.encoding}; binary_little_endian is expected")
     for name, wanted in {"chunk": BOUNDS, "vertex": PACKED, "sh": ()}.items():
         ply.require(name, wanted, "a PLY as SuperSplat packs it")
-    num, types = ply.counts["vertex"], [ply.fields["vertex"][name] for name in PACKED]
+    num = ply.counts["vertex"]
+    types = [ply.fields["vertex"][name] for name in PACKED]
     if set(types) != {"u4"}:
         raise ValueError(f"{path}: packed attributes must be uint; got {types}")
     if ply.counts["chunk"] != -(-num // CHUNK):
@@ -296,59 +332,50 @@ def unpacked_vertices(ply: PlyFile) -> np.ndarray:
 
     def within(what: str, axes: str, shares: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Return columns scaled between their bounds."""
-        ends = [(chunks[f"min_{what}{axis}"], chunks[f"max_{what}{axis}"]) for axis in axes]
-        return [low * (1 - share) + high * share for (low, high), share in zip(ends, shares, strict=True)]
+        scaled = []
+        for axis, share in zip(axes, shares, strict=True):
+            scaled.append(chunks[f"min_{what}{axis}"] * (1 - share) + chunks[f"max_{what}{axis}"] * share)
+        return scaled
 
-    columns = dict(zip(AXES, within("", AXES, _unpacked(vertices["packed_position"], (11, 10, 11))), strict=True))
-    scales = within("scale_", AXES, _unpacked(vertices["packed_scale"], (11, 10, 11)))
+    columns = dict(zip(AXES, within("", AXES, _shares(vertices["packed_position"], THREE_BITS)), strict=True))
+    scales = within("scale_", AXES, _shares(vertices["packed_scale"], THREE_BITS))
     columns |= {f"scale_{k}": scale for k, scale in enumerate(scales)}
-    # The highest bits of a rotation hold the index of its largest number, which follows from the smaller.
-    packed = vertices["packed_rotation"]
-    smaller = np.stack(
-        # Numbers other than the largest of a unit quaternion are within ±1/√2.
-        [(share - 0.5) * np.sqrt(2) for share in _unpacked(packed & np.uint32((1 << 30) - 1), (10,) * 3)],
-        axis=1,
-    )
-    quats = others.with_largest(smaller, packed >> np.uint32(30))
-    columns |= {f"rot_{k}": quats[:, k] for k in range(4)}
-    *colors, opacity = _unpacked(vertices["packed_color"], (8,) * 4)
+    # The index of the largest number of a rotation, which follows from the others. These are within ±1/√2.
+    largest = vertices["packed_rotation"] >> np.uint32(30)
+    _, *smaller = _shares(vertices["packed_rotation"], QUAT_BITS)
+    quats = with_largest((np.stack(smaller, axis=1) - 0.5) * np.sqrt(2), largest)
+    columns |= {name: quats[:, k] for k, name in enumerate(QUATS)}
+    *colors, opacity = _shares(vertices["packed_color"], COLOR_BITS)
     # Older files have colours in [0, 1] without bounds.
     if set(COLOR_BOUNDS) <= set(ply.fields["chunk"]):
         colors = within("", CHANNELS, colors)
     columns |= {f"f_dc_{k}": (color - 0.5) / SH_C0 for k, color in enumerate(colors)}
     # Bytes 0 and 255 have no finite logit.
-    opacity = np.clip(opacity, others.LEAST_OPACITY, 1 - others.LEAST_OPACITY)
-    columns["opacity"] = np.log(opacity) - np.log1p(-opacity)
+    opacity = np.clip(opacity, LEAST_OPACITY, 1 - LEAST_OPACITY)
+    columns["opacity"] = logits_of(opacity)
     for name in ply.fields["sh"] if rest else ():
         codes = rest[0][name].astype(np.float64)
         # Centres of 256 bins, except at the ends, as SuperSplat decodes them.
         shares = np.where(codes == 0, 0.0, np.where(codes == 255, 1.0, (codes + 0.5) / 256))
         columns[name] = (shares - 0.5) * SH_RANGE
-    found = np.empty(num, [(name, "<f4") for name in columns])
+    unpacked = np.empty(num, [(name, "<f4") for name in columns])
     for name, values in columns.items():
-        found[name] = values
-    return found
+        unpacked[name] = values
+    return unpacked
 
 
-def _unpacked(packed: np.ndarray, bits: tuple[int, ...]) -> list[np.ndarray]:
+def _shares(packed: np.ndarray, bits: tuple[int, ...]) -> list[np.ndarray]:
     """Return numbers in [0, 1] of unsigned integers packed into one, the first highest."""
-    found, shift = [], sum(bits)
-    for num in bits:
-        shift -= num
-        found.append(((packed >> np.uint32(shift)) & np.uint32((1 << num) - 1)) / ((1 << num) - 1))
-    return found
+    return [column / ((1 << num) - 1) for column, num in zip(unpack_bits(packed, bits), bits, strict=True)]
 
 
 def _packed(shares: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
-    """Return numbers [N, C] in [0, 1] packed into one unsigned integer, as `_unpacked` reads them."""
-    packed = np.zeros(len(shares), np.uint32)
-    for column, num in zip(shares.T, bits, strict=True):
-        steps = np.uint32((1 << num) - 1)
-        packed = packed << np.uint32(num) | np.rint(np.clip(column, 0, 1) * steps).astype(np.uint32)
-    return packed
+    """Return numbers [N, C] in [0, 1] packed into one unsigned integer, as `_shares` reads them."""
+    steps = np.asarray([(1 << num) - 1 for num in bits])
+    return pack_bits(np.rint(np.clip(shares, 0, 1) * steps).T, bits)
 
 
-def encode_packed_ply(placed: others.PlacedSplats) -> bytes:
+def encode_packed_ply(placed: PlacedSplats) -> bytes:
     """Return splats as a PLY as SuperSplat packs it."""
     splats = placed.splats
     num = len(splats.means)
@@ -366,29 +393,24 @@ def encode_packed_ply(placed: others.PlacedSplats) -> bytes:
         width = (high - low).astype(np.float64)[chunks]
         shares.append((values - low[chunks]) / np.where(width > 0, width, 1.0))
     positions, scales, shares_of_colors = shares
-    largest, smaller = others.without_largest(splats.quats)
-    rotations = largest.astype(np.uint32) << np.uint32(30) | _packed(smaller / np.sqrt(2) + 0.5, (10,) * 3)
-    # In the order of PACKED.
-    vertices = np.stack(
-        [
-            _packed(positions, (11, 10, 11)),
-            rotations,
-            _packed(scales, (11, 10, 11)),
-            _packed(np.concatenate([shares_of_colors, splats.opacities[:, None]], axis=1), (8,) * 4),
-        ],
-        axis=1,
-    )
+    largest, smaller = without_largest(splats.quats)
+    # In the order of PACKED. The largest number of a rotation is an index of two bits, from 0 to 3.
+    vertices = [
+        _packed(positions, THREE_BITS),
+        _packed(np.concatenate([largest[:, None] / 3, smaller / np.sqrt(2) + 0.5], axis=1), QUAT_BITS),
+        _packed(scales, THREE_BITS),
+        _packed(np.concatenate([shares_of_colors, splats.opacities[:, None]], axis=1), COLOR_BITS),
+    ]
     # Channel by channel; a byte is one of 256 bins.
     rest = splats.sh[:, 1:].transpose(0, 2, 1).reshape(num, -1)
     codes = np.floor(np.clip((rest / SH_RANGE + 0.5) * 256, 0, 255)).astype(np.uint8)
-    elements = [
-        ("chunk", len(starts), "float", (*BOUNDS, *COLOR_BOUNDS)),
-        ("vertex", num, "uint", PACKED),
-        ("sh", num, "uchar", SH_REST[: rest.shape[1]]),
-    ]
-    header = f"ply\nformat binary_little_endian 1.0\ncomment {FLAT_MARK}\n{place_comments(placed.offset, placed.turn)}"
-    for name, count, kind, attributes in elements:
+    names = {"chunk": (*BOUNDS, *COLOR_BOUNDS), "vertex": PACKED, "sh": SH_REST[: rest.shape[1]]}
+    counts = {"chunk": len(starts), "vertex": num, "sh": num}
+    kinds = {"chunk": "float", "vertex": "uint", "sh": "uchar"}
+    elements = []
+    for element, attributes in names.items():
         if attributes:
-            header += f"element {name} {count}\n" + "".join(f"property {kind} {each}\n" for each in attributes)
-    columns = (np.concatenate(bounds, axis=1).astype("<f4"), vertices.astype("<u4"), codes)
-    return f"{header}end_header\n".encode("ascii") + b"".join(column.tobytes() for column in columns)
+            elements.append((element, counts[element], [(kinds[element], name) for name in attributes]))
+    columns = (np.concatenate(bounds, axis=1).astype("<f4"), np.stack(vertices, axis=1).astype("<u4"), codes)
+    header = _header(place_comments(placed.offset, placed.turn), elements)
+    return header + b"".join(column.tobytes() for column in columns)

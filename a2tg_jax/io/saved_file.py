@@ -4,11 +4,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
-
 from a2tg_jax.host.json_text import read_json
-from a2tg_jax.host.regular_files import is_regular
-from a2tg_jax.host.text import shortened
+from a2tg_jax.host.regular_files import expanded
+from a2tg_jax.io.validate import check_exists
 
 T = TypeVar("T")
 VERSION = 1
@@ -21,8 +19,8 @@ def load_saved(path: Path, kind: str, parse: Callable[[dict[str, Any]], T]) -> T
       FileNotFoundError: if there is no such file.
       ValueError: naming the file, if it is of another kind or version, or `parse` raises ValueError.
     """
-    if not is_regular(path):
-        raise FileNotFoundError(f"{path}: no such {kind}; the viewer's 'Save {kind}' makes one")
+    path = expanded(path)
+    check_exists(path, f"{kind}; the viewer's 'Save {kind}' makes one")
     data = read_json(path, allow_nan=False)
     try:
         if not isinstance(data, dict) or (data.get("format"), data.get("version")) != (f"a2tg-jax {kind}", VERSION):
@@ -31,13 +29,3 @@ def load_saved(path: Path, kind: str, parse: Callable[[dict[str, Any]], T]) -> T
         return parse(data)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-
-
-def numbers_of(values: object, count: int, name: str, null: float | None = None) -> np.ndarray:
-    """Return a list of numbers as an array [count]; null becomes `null`, if that is given. Raises ValueError with
-    `name` for anything else."""
-    kinds = (int, float) if null is None else (int, float, type(None))
-    if not isinstance(values, list) or len(values) != count or not all(type(x) in kinds for x in values):
-        wanted = f"{count} numbers{'' if null is None else ' or null'}"
-        raise ValueError(f"{name} must be {wanted}; got {shortened(values)}")
-    return np.array([null if x is None else x for x in values], np.float64)

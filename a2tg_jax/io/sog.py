@@ -23,17 +23,25 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 from scipy import sparse
 
+from a2tg_jax.core.checks import check_int
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.data.decoding import MOST_BYTES
 from a2tg_jax.data.ply import OFFSET, ROTATION, turn_of
 from a2tg_jax.host.json_text import parse_json
 from a2tg_jax.host.regular_files import read_regular, room_of
 from a2tg_jax.host.text import PROGRAM, shortened
-from a2tg_jax.io import other_programs as others
-from a2tg_jax.io.columns import LARGEST_FLOAT, LONGEST_WEBP_SIDE
+from a2tg_jax.io.columns import LONGEST_WEBP_SIDE
 from a2tg_jax.io.gltf_container import LONGEST_NAME
+from a2tg_jax.io.other_programs import (
+    Ellipsoids,
+    PlacedSplats,
+    model_of_splats,
+    origin_at,
+    with_largest,
+    without_largest,
+)
 from a2tg_jax.io.ply import place_marks
-from a2tg_jax.io.validate import existing_bytes, reading
+from a2tg_jax.io.validate import existing_bytes, numbers_of, reading
 from a2tg_jax.model import Model
 
 HEADER = "meta.json"
@@ -84,10 +92,10 @@ def load_sog(path: Path) -> Model:
         header = files.header
         with np.errstate(over="ignore", invalid="ignore"):  # Rows that are not finite are left out.
             splats = _splats(files)
-        offset = _numbers(header, OFFSET, 3, HEADER) if OFFSET in header else np.zeros(3)
-        quat = _numbers(header, ROTATION, 4, HEADER) if ROTATION in header else None
-        is_flat = header.get("model") == FLAT
-        return others.model_of_splats(splats, path, is_flat=is_flat, origin=others.origin_at(offset, turn_of(quat)))
+        offset = _numbers(header, OFFSET, 3) if OFFSET in header else np.zeros(3)
+        quat = _numbers(header, ROTATION, 4) if ROTATION in header else None
+        origin = origin_at(offset, turn_of(quat))
+        return model_of_splats(splats, path, is_flat=header.get("model") == FLAT, origin=origin)
 
 
 def sog_files(path: Path) -> list[Path]:
@@ -156,61 +164,63 @@ def _checked_header(data: bytes) -> dict[str, Any]:
 
 def _named_pictures(header: dict[str, Any]) -> list[str]:
     """Return the names of all pictures. ValueError: one is missing, or is no plain name."""
-    names = []
+    names: list[str] = []
     for group, count in PICTURES.items():
         if group == "shN" and not header.get(group):
             continue
         described = header.get(group)
         if not isinstance(described, dict):
             raise ValueError(f"{HEADER} describes no {group}; got {shortened(described)}")
-        found = described.get("files")
-        if not isinstance(found, list) or len(found) != count or not all(isinstance(name, str) for name in found):
-            raise ValueError(f"{HEADER} must name {count} pictures of {group}; got {shortened(found)}")
-        for name in found:
+        pictures: Any = described.get("files")
+        is_list = isinstance(pictures, list) and len(pictures) == count
+        if not is_list or not all(isinstance(name, str) for name in pictures):
+            raise ValueError(f"{HEADER} must name {count} pictures of {group}; got {shortened(pictures)}")
+        for name in pictures:
             is_plain = PurePosixPath(name).name == name and "\\" not in name and "\0" not in name
             if not is_plain or len(name) > LONGEST_NAME:
                 raise ValueError(
                     f"{HEADER} names the picture {shortened(name)}; a short name without folders is wanted"
                 )
-        names += found
+        names += pictures
     return names
 
 
-def _splats(files: _Files) -> others.Ellipsoids:
+def _splats(files: _Files) -> Ellipsoids:
     header = files.header
     is_first = header.get("version", 1) == 1
-    num = _count(header["means"]["shape"][0] if is_first else header["count"], "splats")
+    num = header["means"]["shape"][0] if is_first else header["count"]
+    check_int(f"the number of splats in {HEADER}", num, 1)
     has_rest = bool(header.get("shN")) and header["shN"].get("bands") != 0
     names = [name for group in ("means", "quats", "scales", "sh0") for name in header[group]["files"]]
-    low, high, turns, scale_codes, color_codes, *labels = _rows(
-        files, [*names, *(header["shN"]["files"][1:] if has_rest else [])], num
-    )
-    ends = [_numbers(header["means"], name, 3, "means") for name in ("mins", "maxs")]
+    if has_rest:
+        names.append(header["shN"]["files"][1])
+    low, high, turns, scale_codes, color_codes, *labels = _rows(files, names, num)
+    first, last = (_numbers(header["means"], name, 3, "means.") for name in ("mins", "maxs"))
     steps = low[:, :3] + 256 * high[:, :3].astype(np.int64)
-    logarithms = ends[0] + steps / LEVELS * (ends[1] - ends[0])
+    logarithms = first + steps / LEVELS * (last - first)
     means = np.sign(logarithms) * np.expm1(np.abs(logarithms))
 
-    if turns[:, 3].min() < LARGEST_INDEX_0:
-        bad = int(np.count_nonzero(turns[:, 3] < LARGEST_INDEX_0))
+    bad = np.count_nonzero(turns[:, 3] < LARGEST_INDEX_0)
+    if bad:
         raise ValueError(
             f"{header['quats']['files'][0]} is damaged: alpha of a rotation is {LARGEST_INDEX_0} to 255, but {bad:,} "
             "pixels have less"
         )
     smaller = (turns[:, :3] / 255 * 2 - 1) / math.sqrt(2)
-    quats = others.with_largest(smaller, turns[:, 3].astype(np.int64) - LARGEST_INDEX_0)
+    quats = with_largest(smaller, turns[:, 3].astype(np.int64) - LARGEST_INDEX_0)
 
-    scales = np.exp(_decoded(header["scales"], "scales", scale_codes[:, :3], is_first=is_first))
+    scales = np.exp(_decoded(header, "scales", scale_codes[:, :3], is_first=is_first))
     if is_first:  # The fourth column is the logit of the opacity.
-        colors = _decoded(header["sh0"], "sh0", color_codes, is_first=True)
+        colors = _decoded(header, "sh0", color_codes, is_first=True)
         opacities = 1 / (1 + np.exp(-colors[:, 3]))
     else:
-        colors = _decoded(header["sh0"], "sh0", color_codes[:, :3], is_first=False)
+        colors = _decoded(header, "sh0", color_codes[:, :3], is_first=False)
         opacities = color_codes[:, 3] / 255
     sh = colors[:, None, :3]
     if has_rest:
         places = labels[0][:, 0] + 256 * labels[0][:, 1].astype(np.int64)
         sh = np.concatenate([sh, _rest(files, places, is_first=is_first)], axis=1)
-    return others.Ellipsoids(*(values.astype(np.float32) for values in (means, quats, scales, opacities, sh)))
+    return Ellipsoids.of(means, quats, scales, opacities, sh)
 
 
 def _rest(files: _Files, places: np.ndarray, *, is_first: bool) -> np.ndarray:
@@ -227,36 +237,27 @@ def _rest(files: _Files, places: np.ndarray, *, is_first: bool) -> np.ndarray:
             f"degree {shortened(described.get('bands'))}"
         )
     room = ENTRIES_A_ROW * len(pixels)
-    count = room if is_first else _count(described["count"], "sets of spherical harmonics")
+    count = room if is_first else described["count"]
+    check_int(f"the number of sets of spherical harmonics in {HEADER}", count, 1)
     if count > room:
         raise ValueError(f"{centroids} holds {room:,} sets of spherical harmonics, but {HEADER} says {count:,}")
     if places.max() >= count:
         raise ValueError(f"{labels} refers to set {places.max():,} of spherical harmonics (from 0) of {count:,}")
     sets = pixels[..., :3].reshape(room, COEFFICIENTS[degree], 3)
     used, inverse = np.unique(places, return_inverse=True)
-    return _decoded(described, "shN", sets[used], is_first=is_first)[inverse]
-
-
-def _count(value: object, what: str) -> int:
-    if type(value) is not int or value < 1:
-        raise ValueError(
-            f"{HEADER} must have a count of {what}, a whole number of at least 1; got {shortened(repr(value))}"
-        )
-    return value
+    return _decoded(files.header, "shN", sets[used], is_first=is_first)[inverse]
 
 
 def _rows(files: _Files, names: list[str], num: int) -> list[np.ndarray]:
     """Return the first pixels [num, 4] of pictures. ValueError: one has fewer, or they differ in size."""
-    found: list[np.ndarray] = []
-    for name in names:
-        pixels = _pixels(files, name)
+    pictures = [_pixels(files, name) for name in names]
+    for name, pixels in zip(names, pictures, strict=True):
         height, width, _ = pixels.shape
         if num > height * width:
             raise ValueError(f"{name} has {width}x{height} pixels, too few for {num:,} splats")
-        if found and pixels.shape != found[0].shape:
+        if pixels.shape != pictures[0].shape:
             raise ValueError(f"{name} has {width}x{height} pixels, and {names[0]} another size")
-        found.append(pixels)
-    return [pixels.reshape(-1, 4)[:num] for pixels in found]
+    return [pixels.reshape(-1, 4)[:num] for pixels in pictures]
 
 
 def _pixels(files: _Files, name: str) -> np.ndarray:
@@ -282,45 +283,35 @@ def _pixels(files: _Files, name: str) -> np.ndarray:
     raise ValueError(f"{name} has {width}x{height} pixels, more than a file of {files.num_bytes:,} bytes may have")
 
 
-def _decoded(described: Mapping[str, Any], group: str, codes: np.ndarray, *, is_first: bool) -> np.ndarray:
+def _decoded(header: Mapping[str, Any], group: str, codes: np.ndarray, *, is_first: bool) -> np.ndarray:
     """Return the numbers of bytes [..., C], by the group's codebook or, in version 1, its ends of each column."""
+    described = header[group]
     if is_first:
         # One pair of ends for all spherical harmonics.
         count = 1 if group == "shN" else codes.shape[-1]
-        low, high = (_numbers(described, name, count, group) for name in ("mins", "maxs"))
+        low, high = (_numbers(described, name, count, f"{group}.") for name in ("mins", "maxs"))
         return low + codes / 255 * (high - low)
     codebook = described.get("codebook")
     if isinstance(codebook, list) and len(codebook) == CODEBOOK and codebook[0] is None:
-        _checked_numbers(codebook[1:], f"{group}.codebook")
+        _, second, *_, last = numbers_of(codebook, CODEBOOK, f"{group}.codebook of {HEADER}", null=0.0).tolist()
         # Early programs left the first number out: https://github.com/playcanvas/engine reads it as one more step.
-        codebook = [codebook[1] + (codebook[1] - codebook[-1]) / (CODEBOOK - 1), *codebook[1:]]
-    book = _checked_numbers(codebook, f"{group}.codebook")
+        codebook = [second + (second - last) / (CODEBOOK - 1), *codebook[1:]]
+    book = numbers_of(codebook, None, f"{group}.codebook of {HEADER}")
     if codes.max() >= len(book):
         raise ValueError(f"{group}.codebook of {HEADER} has {len(book)} numbers, but a pixel refers to {codes.max()}")
     return book[codes]
 
 
-def _numbers(described: Mapping[str, Any], name: str, count: int, group: str) -> np.ndarray:
+def _numbers(described: Mapping[str, Any], name: str, count: int, group: str = "") -> np.ndarray:
     """Return a field of `count` numbers; one may be without a list."""
     values = described.get(name)
-    found = _checked_numbers(values if isinstance(values, list) else [values], f"{group}.{name}")
-    if len(found) != count:
-        raise ValueError(f"{group}.{name} of {HEADER} must be {count} numbers; got {len(found)}")
-    return found
-
-
-def _checked_numbers(values: object, what: str) -> np.ndarray:
-    if not isinstance(values, list) or not values:
-        raise ValueError(f"{what} of {HEADER} must be a list of numbers; got {shortened(values)}")
-    if not all(type(value) in (int, float) and abs(value) <= LARGEST_FLOAT for value in values):
-        raise ValueError(f"{what} of {HEADER} must be finite numbers; got {shortened(values)}")
-    return np.array(values, np.float64)
+    return numbers_of(values if isinstance(values, list) else [values], count, f"{group}{name} of {HEADER}")
 
 
 # Writing
 
 
-def encode_sog(placed: others.PlacedSplats) -> bytes:
+def encode_sog(placed: PlacedSplats) -> bytes:
     """Return splats as a *.sog, always the same for the same splats."""
     splats = placed.splats
     num = len(splats.means)
@@ -329,7 +320,7 @@ def encode_sog(placed: others.PlacedSplats) -> bytes:
     high = logarithms.max(axis=0)
     shares = (logarithms - low) / np.where(high > low, high - low, 1.0)
     steps = np.rint(shares * LEVELS).astype(np.int64)
-    largest, smaller = others.without_largest(splats.quats)
+    largest, smaller = without_largest(splats.quats)
     turns = np.concatenate([255 * (smaller / math.sqrt(2) + 0.5), LARGEST_INDEX_0 + largest[:, None]], axis=1)
     scale_book, scale_codes = _coded(np.log(splats.scales))
     color_book, color_codes = _coded(splats.sh[:, 0])
@@ -355,9 +346,10 @@ def encode_sog(placed: others.PlacedSplats) -> bytes:
         pictures[names[0]] = _webp(codes.reshape(-1, 3), ENTRIES_A_ROW * COEFFICIENTS[degree])
         pictures[names[1]] = _webp(np.stack([labels & 255, labels >> 8, 0 * labels], axis=1), width)
     header |= {word: numbers.tolist() for word, numbers in place_marks(placed.offset, placed.turn).items()}
+    pictures[HEADER] = json.dumps(header, separators=(",", ":")).encode()
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w") as archive:
-        for name, content in (pictures | {HEADER: json.dumps(header, separators=(",", ":")).encode()}).items():
+        for name, content in pictures.items():
             # A fresh ZipInfo has a fixed date.
             archive.writestr(zipfile.ZipInfo(name), content)
     return data.getvalue()
@@ -419,11 +411,11 @@ def _palette(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _halves(rows: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the rows of a group on either side of the median along its widest direction."""
-    own = rows[group]
+    members = rows[group]
     # Some rows are enough for a direction.
-    sample = own[:: math.ceil(len(own) / LARGEST_GROUP)]
+    sample = members[:: math.ceil(len(members) / LARGEST_GROUP)]
     widest = np.linalg.eigh(np.cov(sample, rowvar=False))[1][:, -1]
-    order = np.argsort(own @ widest, kind="stable")
+    order = np.argsort(members @ widest, kind="stable")
     middle = len(group) // 2
     return group[order[:middle]], group[order[middle:]]
 
@@ -431,10 +423,15 @@ def _halves(rows: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray
 def _clustered(rows: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return `count` centres [count, D] of rows [N, D] by k-means, and the nearest centre [N] of each row."""
     centres = rows[np.linspace(0, len(rows) - 1, count).astype(np.int64)]
+    ones = np.ones(len(rows), np.float32)
     for _ in range(CLUSTER_STEPS):
-        nearest = np.argmin((centres**2).sum(axis=1) - 2 * (rows @ centres.T), axis=1)
-        ones = np.ones(len(rows), np.float32)
+        nearest = _nearest(rows, centres)
         members = sparse.csr_array((ones, (nearest, np.arange(len(rows)))), (count, len(rows)))
         counts = np.bincount(nearest, minlength=count)[:, None]
         centres = np.where(counts > 0, members @ rows / np.maximum(counts, 1), centres).astype(np.float32)
-    return centres, np.argmin((centres**2).sum(axis=1) - 2 * (rows @ centres.T), axis=1)
+    return centres, _nearest(rows, centres)
+
+
+def _nearest(rows: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    """Return the index [N] of the centre nearest to each row."""
+    return np.argmin((centres**2).sum(axis=1) - 2 * (rows @ centres.T), axis=1)

@@ -15,22 +15,30 @@ Every length is checked against the file before anything is unpacked.
 
 import dataclasses
 import gzip
-import os
 import struct
 import zlib
 from collections.abc import Mapping
+from pathlib import Path
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-import zstandard
 
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity, transform_gaussians
 from a2tg_jax.host.regular_files import room_of
-from a2tg_jax.io import other_programs as others
-from a2tg_jax.io.validate import existing_bytes, reading
+from a2tg_jax.io.columns import unzstd
+from a2tg_jax.io.other_programs import (
+    Ellipsoids,
+    PlacedSplats,
+    degree_to_read,
+    model_of_splats,
+    pack_bits,
+    unpack_bits,
+    with_largest,
+    without_largest,
+)
 from a2tg_jax.model import Model
 
 MAGIC = b"NGSP"
@@ -52,80 +60,68 @@ AXES = (
 """Directions of x, y and z by their number in the record, from 1."""
 DIRECTIONS = {"R": (1, 0, 0), "L": (-1, 0, 0), "D": (0, 1, 0), "U": (0, -1, 0), "F": (0, 0, 1), "B": (0, 0, -1)}
 """Right, left, down, up, front and back in the axes of a PLY."""
-PLY_AXES, GLTF_AXES = "RDF", "RUB"
+PLY_AXES = "RDF"
+GLTF_AXES = "RUB"
 HIGHEST_DEGREE = 4
-WRITTEN_VERSION, FRACTIONAL_BITS = 3, 12
+WRITTEN_VERSION = 3
+FRACTIONAL_BITS = 12
+ROTATION_BITS = (2, 1, 9, 1, 9, 1, 9)
+"""Index of the largest number, then sign and magnitude of each of the others."""
 COLOR_SCALE = 0.15
 SH_STEPS = (8, 16)
 """Steps of 1/128 to which coefficients of degree 1, and of higher ones, are rounded, as Niantic's library does."""
 
 
-class SpzSplats(NamedTuple):
-    """Splats of a file, and the axes that it declares; "" if it declares none."""
-
-    splats: others.Ellipsoids
-    axes: str
-
-
 # Reading
 
 
-def load_spz(path: str | os.PathLike[str]) -> Model:
-    """Read Gaussians from a file, in a world with the axes of a PLY. Ellipsoids are flattened as `load_ply` does.
-
-    Raises:
-      FileNotFoundError: if there is no such file.
-      ValueError: if it is not SPZ, is damaged or cut off, or contradicts itself.
-    """
-    data = existing_bytes(path, "file")
-    with reading(path):
-        return spz_model(data, path, PLY_AXES)
-
-
-def spz_model(data: bytes, path: str | os.PathLike[str], axes: str) -> Model:
+def decode_spz(data: bytes, path: Path, axes: str = PLY_AXES) -> Model:
     """Return the model of an SPZ file's bytes, in a world with these axes; messages name the path.
 
-    A file that declares no axes is taken to have them.
+    A file that declares no axes is taken to have them. Ellipsoids become flat as in `load_ply`. Coefficients above
+    degree 3 are left out, with a warning.
+
+    Raises:
+      ValueError: if the bytes are no SPZ, are damaged or cut off, or contradict themselves.
     """
-    splats, declared = decode_spz(data, os.fspath(path))
-    model = others.model_of_splats(splats, path)
-    return dataclasses.replace(model, gaussians=_turned(model.gaussians, declared or axes, axes))
-
-
-def decode_spz(data: bytes, name: str) -> SpzSplats:
-    """Return the splats of an SPZ file's bytes, in its axes. Coefficients above degree 3 are left out, with a warning
-    that has the file's name. ValueError: the bytes are damaged."""
     if data[:4] == MAGIC:
         head, columns, records = _columns_of_streams(data)
     elif data[:2] == GZIP_MAGIC:
         head, columns, records = _columns_of_gzip(data)
     else:
         raise ValueError("is not SPZ")
-    rows = {key: column.reshape(head.num, -1) for key, column in columns.items()}
-    if head.version == 1:
-        means = rows["positions"].view("<f2").astype(np.float64)
-    else:
-        # A sign bit in the highest of three bytes: shifted up, then down.
-        low, middle, high = (rows["positions"].reshape(head.num, 3, 3)[..., k].astype(np.int32) for k in range(3))
-        fixed = ((low << 8) | (middle << 16) | (high << 24)) >> 8
-        means = fixed / 2.0**head.fractional_bits
-    if head.version < 3:
-        xyz = rows["rotations"] / 127.5 - 1
-        w = np.sqrt(np.maximum(1 - np.sum(xyz**2, axis=1, keepdims=True), 0.0))
-        quats = np.concatenate([w, xyz], axis=1)
-    else:
-        packed = rows["rotations"].view("<u4")
-        fields = np.stack([packed[:, 0] >> shift & 1023 for shift in (20, 10, 0)], axis=1).astype(np.int64)
-        smaller = (fields & 511) / 511 * np.sqrt(0.5) * np.where(fields & 512, -1.0, 1.0)
-        quats = others.with_largest(smaller, packed[:, 0] >> 30)[:, [3, 0, 1, 2]]
-    degree = others.degree_to_read(head.degree, name)
+    degree = degree_to_read(head.degree, str(path))
+    rows = {name: column.reshape(head.num, -1) for name, column in columns.items()}
     rest = (rows["sh"].reshape(head.num, -1, 3)[:, : NUM_BASES[degree] - 1].astype(np.float64) - 128) / 128
     colors = (rows["colors"] / 255 - 0.5) / COLOR_SCALE
-    numbers = (
-        means, quats, np.exp(rows["scales"] / 16 - 10), rows["opacities"][:, 0] / 255,
-        np.concatenate([colors[:, None], rest], axis=1),
-    )  # fmt: skip
-    return SpzSplats(others.Ellipsoids(*(values.astype(np.float32) for values in numbers)), _declared_axes(records))
+    sh = np.concatenate([colors[:, None], rest], axis=1)
+    scales = np.exp(rows["scales"] / 16 - 10)
+    opacities = rows["opacities"][:, 0] / 255
+    splats = Ellipsoids.of(_means(rows["positions"], head), _quats(rows["rotations"], head), scales, opacities, sh)
+    model = model_of_splats(splats, path)
+    declared = _declared_axes(records)
+    return dataclasses.replace(model, gaussians=_turned(model.gaussians, declared or axes, axes))
+
+
+def _means(rows: np.ndarray, head: "_Head") -> np.ndarray:
+    if head.version == 1:
+        return rows.view("<f2").astype(np.float64)
+    # A sign bit in the highest of three bytes: shifted up, then down.
+    low, middle, high = rows.reshape(head.num, 3, 3).astype(np.int32).transpose(2, 0, 1)
+    fixed = ((low << 8) | (middle << 16) | (high << 24)) >> 8
+    return fixed / 2.0**head.fractional_bits
+
+
+def _quats(rows: np.ndarray, head: "_Head") -> np.ndarray:
+    if head.version < 3:
+        xyz = rows / 127.5 - 1
+        w = np.sqrt(np.maximum(1 - np.sum(xyz**2, axis=1, keepdims=True), 0.0))
+        return np.concatenate([w, xyz], axis=1)
+    largest, *fields = unpack_bits(rows.view("<u4")[:, 0], ROTATION_BITS)
+    signs = np.stack(fields[::2], axis=1)
+    magnitudes = np.stack(fields[1::2], axis=1)
+    smaller = magnitudes / 511 * np.sqrt(0.5) * np.where(signs, -1.0, 1.0)
+    return with_largest(smaller, largest)[:, [3, 0, 1, 2]]
 
 
 class _Head(NamedTuple):
@@ -143,11 +139,6 @@ class _Head(NamedTuple):
             "positions": 6 if self.version == 1 else 9, "opacities": 1, "colors": 3, "scales": 3,
             "rotations": 3 if self.version < 3 else 4, "sh": 3 * ((self.degree + 1) ** 2 - 1),
         }  # fmt: skip
-
-    @property
-    def num_bytes(self) -> int:
-        """Bytes of all columns."""
-        return self.num * sum(self.widths.values())
 
 
 def _head_of(data: bytes) -> _Head:
@@ -174,23 +165,22 @@ def _columns_of_gzip(data: bytes) -> tuple[_Head, dict[str, np.ndarray], bytes]:
         unpacked = stream.decompress(data, room_of(len(data)))
     except zlib.error as error:
         raise ValueError(f"is damaged: its gzip stream cannot be unpacked ({error})") from error
+    if stream.unconsumed_tail:
+        raise ValueError("unpacks to more than 64 times its size")
     if not stream.eof:
-        is_long = bool(stream.unconsumed_tail)
-        raise ValueError(
-            "unpacks to more than 64 times its size" if is_long else "is cut off: its gzip stream has no end"
-        )
+        raise ValueError("is cut off: its gzip stream has no end")
     head = _head_of(unpacked)
     if head.version > 3:
         raise ValueError(f"is damaged: SPZ of version {head.version} is no gzip stream")
-    place = HEAD.size
-    if place + head.num_bytes > len(unpacked):
-        needed = place + head.num_bytes
-        raise ValueError(f"is cut off: {head.num:,} splats need {needed:,} bytes, and {len(unpacked):,} are there")
+    end = HEAD.size + head.num * sum(head.widths.values())
+    if end > len(unpacked):
+        raise ValueError(f"is cut off: {head.num:,} splats need {end:,} bytes, and {len(unpacked):,} are there")
     columns = {}
+    place = HEAD.size
     for name, width in head.widths.items():
         columns[name] = np.frombuffer(unpacked, np.uint8, head.num * width, place)
         place += head.num * width
-    return head, columns, unpacked[place:] if head.flags & HAS_EXTENSIONS else b""
+    return head, columns, unpacked[end:] if head.flags & HAS_EXTENSIONS else b""
 
 
 def _columns_of_streams(data: bytes) -> tuple[_Head, dict[str, np.ndarray], bytes]:
@@ -206,7 +196,7 @@ def _columns_of_streams(data: bytes) -> tuple[_Head, dict[str, np.ndarray], byte
             f"is damaged: it has {head.num_streams} streams, where degree {head.degree} has {len(widths)}, and their "
             f"table at byte {table:,} of {len(data):,}"
         )
-    if head.num_bytes > room_of(len(data)):
+    if head.num * sum(head.widths.values()) > room_of(len(data)):
         raise ValueError(f"claims {head.num:,} splats, more than a file of {len(data):,} bytes may unpack to")
     columns = {"sh": np.zeros(0, np.uint8)}
     for index, (name, width) in enumerate(widths.items()):
@@ -216,30 +206,18 @@ def _columns_of_streams(data: bytes) -> tuple[_Head, dict[str, np.ndarray], byte
                 f"is damaged or cut off: {packed:,} bytes of {name} at byte {place:,} unpack to {unpacked:,}, where "
                 f"{head.num:,} splats have {head.num * width:,}"
             )
-        columns[name] = _unpacked(data[place : place + packed], unpacked, name)
+        try:
+            columns[name] = np.frombuffer(unzstd(data[place : place + packed], unpacked), np.uint8)
+        except ValueError as error:
+            raise ValueError(f"is damaged: {name} cannot be unpacked ({error})") from error
         place += packed
     return head, columns, data[LONG_HEAD_BYTES:table] if head.flags & HAS_EXTENSIONS else b""
 
 
-def _unpacked(data: bytes, size: int, name: str) -> np.ndarray:
-    """Return the bytes [size] of a zstd frame."""
-    try:
-        announced = zstandard.get_frame_parameters(data).content_size
-        # The library allocates what the frame announces.
-        if announced not in (size, zstandard.CONTENTSIZE_UNKNOWN):
-            raise ValueError(f"its frame announces {announced:,} bytes")
-        unpacked = zstandard.ZstdDecompressor().decompress(data, max_output_size=size, allow_extra_data=False)
-    except (zstandard.ZstdError, ValueError) as error:
-        raise ValueError(f"is damaged: {name} cannot be unpacked ({error})") from error
-    if len(unpacked) != size:
-        raise ValueError(f"is damaged: {name} unpack to {len(unpacked):,} bytes; {size:,} were announced")
-    return np.frombuffer(unpacked, np.uint8)
-
-
 def _declared_axes(records: bytes) -> str:
     """Return the axes that the extensions of a file declare; "" if they declare none."""
-    place = 0
     axes = ""
+    place = 0
     while place + RECORD.size <= len(records):
         kind, length = RECORD.unpack_from(records, place)
         place += RECORD.size
@@ -256,13 +234,13 @@ def _declared_axes(records: bytes) -> str:
 
 
 def _turned(gaussians: Gaussians, axes: str, wanted: str) -> Gaussians:
-    """Return Gaussians with these axes in a world with others."""
+    """Return Gaussians with these axes in a world with"""
     if axes == wanted:
         return gaussians
-    own = np.array([DIRECTIONS[letter] for letter in axes], np.float64)
-    other = np.array([DIRECTIONS[letter] for letter in wanted], np.float64)
-    # Columns of ownᵀ are the directions of the file's axes.
-    matrix = other @ own.T
+    directions = np.array([DIRECTIONS[letter] for letter in axes], np.float64)
+    wanted_directions = np.array([DIRECTIONS[letter] for letter in wanted], np.float64)
+    # Columns of the transpose are the directions of the file's axes.
+    matrix = wanted_directions @ directions.T
     if np.linalg.det(matrix) < 0:
         # Left-handed axes: z → −z first. A Gaussian's rotation R becomes M·R·M, and Y_lm changes by (−1)^(l + m).
         flip = np.array([1.0, 1.0, -1.0])
@@ -281,15 +259,16 @@ def _turned(gaussians: Gaussians, axes: str, wanted: str) -> Gaussians:
 # Writing
 
 
-def encode_spz(placed: others.PlacedSplats) -> bytes:
+def encode_spz(placed: PlacedSplats) -> bytes:
     """Return splats as an SPZ file, always the same for the same splats."""
     splats = placed.splats
     num = len(splats.means)
     degree = NUM_BASES.index(splats.sh.shape[1])
     fixed = np.rint(splats.means.astype(np.float64) * 2**FRACTIONAL_BITS).astype("<i4")
-    largest, smaller = others.without_largest(splats.quats[:, [1, 2, 3, 0]].astype(np.float64))
-    fields = np.rint(np.abs(smaller) * np.sqrt(2) * 511).astype(np.uint32) | (smaller < 0).astype(np.uint32) << 9
-    rotations = largest.astype(np.uint32) << 30 | fields[:, 0] << 20 | fields[:, 1] << 10 | fields[:, 2]
+    largest, smaller = without_largest(splats.quats[:, [1, 2, 3, 0]].astype(np.float64))
+    magnitudes = np.rint(np.abs(smaller) * np.sqrt(2) * 511)
+    fields = np.stack([smaller < 0, magnitudes], axis=2).reshape(num, 6)
+    rotations = pack_bits([largest, *fields.T], ROTATION_BITS)
     rest = np.rint(splats.sh[:, 1:] * 128).astype(np.int64) + 128
     steps = np.where(np.arange(rest.shape[1]) < 3, *SH_STEPS)[:, None]
     columns = (
@@ -297,7 +276,7 @@ def encode_spz(placed: others.PlacedSplats) -> bytes:
         _to_bytes(255 * splats.opacities),
         _to_bytes(255 * (COLOR_SCALE * splats.sh[:, 0] + 0.5)),
         _to_bytes(16 * (np.log(splats.scales) + 10)),
-        rotations.astype("<u4"),
+        rotations,
         _to_bytes((rest + steps // 2) // steps * steps),
     )
     head = HEAD.pack(MAGIC, WRITTEN_VERSION, num, degree, FRACTIONAL_BITS, 0, 0)

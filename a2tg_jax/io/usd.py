@@ -11,7 +11,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,17 +22,28 @@ from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.json_text import parse_json
 from a2tg_jax.host.npz import read_npz
-from a2tg_jax.host.regular_files import MOST_ARRAY_BYTES, expanded, is_regular, open_regular
+from a2tg_jax.host.regular_files import MOST_ARRAY_BYTES, expanded, open_regular
 from a2tg_jax.host.text import shortened
-from a2tg_jax.io import other_programs as others, usd_fields
+from a2tg_jax.io import usd_fields
 from a2tg_jax.io.model_file import background_of, origin_of
-from a2tg_jax.io.validate import check_model, check_suffix, live_model, reading
+from a2tg_jax.io.other_programs import (
+    Ellipsoids,
+    degree_to_read,
+    gaussians_of,
+    joined_parts,
+    matrix_of,
+    origin_to_json,
+    splats_of,
+    upright,
+)
+from a2tg_jax.io.validate import check_exists, check_model, check_suffix, live_model, reading
 from a2tg_jax.model import Model
 
 ORIGIN = "a2tg:origin"
 """Name of the origin, as JSON, in the custom data of a particle field."""
 ATTRIBUTES = ("Position", "Orientation", "Scale", "Opacity", "SphericalHarmonics")
-SURFLET, ELLIPSOID = "ParticleFieldKernelGaussianSurfletAPI", "ParticleFieldKernelGaussianEllipsoidAPI"
+SURFLET = "ParticleFieldKernelGaussianSurfletAPI"
+ELLIPSOID = "ParticleFieldKernelGaussianEllipsoidAPI"
 
 
 def save_usd(path: str | os.PathLike[str], model: Model, *, ellipsoids: bool = False) -> None:
@@ -77,7 +88,8 @@ def import_usd() -> Any:
 
 def _stage_of(model: Model, ellipsoids: bool) -> Any:
     """Return a stage of one particle field."""
-    usd, splats = import_usd(), others.splats_of(model)
+    usd = import_usd()
+    splats = splats_of(model)
     stage = usd.Usd.Stage.CreateInMemory()
     usd.UsdGeom.SetStageUpAxis(stage, usd.UsdGeom.Tokens.z)
     # USD's default is centimetres.
@@ -91,10 +103,11 @@ def _stage_of(model: Model, ellipsoids: bool) -> Any:
         for name in ATTRIBUTES:
             getattr(usd.UsdVol, f"ParticleField{name}AttributeAPI").Apply(prim)
         getattr(usd.UsdVol, SURFLET).Apply(prim)
-    matrix = others.matrix_of(others.upright(model.origin, "z"))
+    matrix = matrix_of(upright(model.origin, "z"))
     # USD's matrices are for row vectors.
     field.AddTransformOp().Set(usd.Gf.Matrix4d(*matrix.T.ravel().tolist()))
-    volume, arrays = usd.UsdVol, usd.Vt
+    volume = usd.UsdVol
+    arrays = usd.Vt
     harmonics = volume.ParticleFieldSphericalHarmonicsAttributeAPI(prim)
     xyzw = splats.quats[:, [1, 2, 3, 0]]
     numbers = (
@@ -113,7 +126,7 @@ def _stage_of(model: Model, ellipsoids: bool) -> Any:
         reach = 3 * splats.scales.max(axis=1, keepdims=True)
         corners = np.stack([(splats.means - reach).min(axis=0), (splats.means + reach).max(axis=0)])
         field.CreateExtentAttr(usd.Vt.Vec3fArray.FromNumpy(corners))
-    kept = {} if model.origin is None else others.origin_to_json(model.origin)
+    kept = {} if model.origin is None else origin_to_json(model.origin)
     if kept or model.background != BLACK:
         kept |= {"background": list(model.background)}
         prim.SetCustomDataByKey(ORIGIN, json.dumps(kept, allow_nan=False))
@@ -139,19 +152,21 @@ def load_usd(path: str | os.PathLike[str]) -> Model:
     check_suffix(path, "load_usd")
     import_usd()
     path = expanded(path)
-    if not is_regular(path):
-        raise FileNotFoundError(f"{path}: no such USD file")
+    check_exists(path, "USD file")
     # usd-core opens the path itself: this checks the size and the permission first.
     open_regular(path, MOST_ARRAY_BYTES).close()
     with reading(path):
         described, arrays = _read_apart(path)
-        up: others.Up = "z" if described["is_z_up"] else "y"
-        to_metres = np.diag([*[described["unit"]] * 3, 1.0])
-        parts = (
-            (_model_of(field, arrays, f"{index}:", path), to_metres @ np.reshape(field["matrix"], (4, 4)))
-            for index, field in enumerate(described["fields"])
-        )
-        return others.joined_parts(parts, up)
+        return joined_parts(_parts(described, arrays, path), "z" if described["is_z_up"] else "y")
+
+
+def _parts(
+    described: Mapping[str, Any], arrays: Mapping[str, np.ndarray], path: Path
+) -> Iterator[tuple[Model, np.ndarray]]:
+    """Yield the model of each particle field, and the matrix from its world to the stage's, in metres."""
+    to_metres = np.diag([*[described["unit"]] * 3, 1.0])
+    for index, field in enumerate(described["fields"]):
+        yield _model_of(field, arrays, f"{index}:", path), to_metres @ np.reshape(field["matrix"], (4, 4))
 
 
 def _read_apart(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -184,7 +199,7 @@ def _model_of(field: Mapping[str, Any], arrays: Mapping[str, np.ndarray], prefix
     degree = field["degree"]
     if f"{prefix}sh" in arrays:
         sh = arrays[f"{prefix}sh"].reshape(num, (degree + 1) ** 2, 3)
-        sh = sh[:, : NUM_BASES[others.degree_to_read(degree, str(path))]]
+        sh = sh[:, : NUM_BASES[degree_to_read(degree, str(path))]]
     else:
         sh = np.zeros((num, 1, 3), np.float32)
 
@@ -193,8 +208,10 @@ def _model_of(field: Mapping[str, Any], arrays: Mapping[str, np.ndarray], prefix
 
     # Quatf arrays become xyzw in NumPy.
     quats = column("orientations", (0.0, 0.0, 0.0, 1.0))[:, [3, 0, 1, 2]]
-    splats = others.Ellipsoids(means, quats, column("scales", (1.0, 1.0, 1.0)), column("opacities", (1.0,))[:, 0], sh)
-    gaussians = others.gaussians_of(splats, path, is_flat=SURFLET in kernels)
+    scales = column("scales", (1.0, 1.0, 1.0))
+    opacities = column("opacities", (1.0,))[:, 0]
+    splats = Ellipsoids(means, quats, scales, opacities, sh)
+    gaussians = gaussians_of(splats, path, is_flat=SURFLET in kernels)
     kept = {"background": BLACK} if field["origin"] is None else parse_json(field["origin"])
     # A model without an origin has a background alone.
     origin = None if set(kept) == {"background"} else origin_of(kept, kept)

@@ -16,7 +16,8 @@ REFUSED = 3
 """Status of the program if usd-core refuses the file."""
 COLUMNS = {"orientations": 4, "scales": 3, "opacities": 1}
 """Columns of the attributes of which each particle has one row, besides its position."""
-DEGREE, COEFFICIENTS = "radiance:sphericalHarmonicsDegree", "radiance:sphericalHarmonicsCoefficients"
+DEGREE = "radiance:sphericalHarmonicsDegree"
+COEFFICIENTS = "radiance:sphericalHarmonicsCoefficients"
 
 
 def main(file: str, out: str, origin: str) -> None:

@@ -24,6 +24,7 @@ from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model, check_is_model
 
 LARGEST_LOG_SCALE = math.log(LARGEST_NUMBER)
+LARGEST_FLOAT = float(np.finfo(np.float32).max)
 LONGEST_REASON = 500
 """Largest number of characters of an error that quotes a file."""
 FUNCTIONS = {
@@ -35,13 +36,13 @@ FUNCTIONS = {
 
 def check_suffix(path: str | os.PathLike[str], function: str) -> None:
     """Raise ValueError if a file has the suffix of another format than the function's, such as "save_ply"."""
-    verb, _, own = function.partition("_")
-    found = FUNCTIONS.get(Path(path).suffix.lower(), own)
-    if found != own:
-        suffix = next(suffix for suffix, name in FUNCTIONS.items() if name == own)
+    verb, _, format = function.partition("_")
+    format_of_suffix = FUNCTIONS.get(Path(path).suffix.lower(), format)
+    if format_of_suffix != format:
+        suffix = next(suffix for suffix, name in FUNCTIONS.items() if name == format)
         does = "writes" if verb == "save" else "reads"
         raise ValueError(
-            f"{shortened(os.fspath(path))}: {function} {does} *{suffix} files; call {verb}_{found} instead"
+            f"{shortened(os.fspath(path))}: {function} {does} *{suffix} files; call {verb}_{format_of_suffix} instead"
         )
 
 
@@ -56,11 +57,46 @@ def live_model(path: str | os.PathLike[str], model: Model, function: str) -> Mod
     return model
 
 
-def existing_bytes(path: str | os.PathLike[str], what: str) -> bytes:
-    """Return the bytes of a regular file. FileNotFoundError, calling it `what`: there is none."""
+def check_exists(path: str | os.PathLike[str], what: str) -> None:
+    """Raise FileNotFoundError, calling it `what`, unless there is a regular file."""
     if not is_regular(path):
         raise FileNotFoundError(f"{os.fspath(path)}: no such {what}")
+
+
+def existing_bytes(path: str | os.PathLike[str], what: str) -> bytes:
+    """Return the bytes of a regular file. FileNotFoundError, calling it `what`: there is none."""
+    check_exists(path, what)
     return read_regular(path, MOST_ARRAY_BYTES)
+
+
+def numbers_of(values: object, count: int | None, name: str, *, null: float | None = None) -> np.ndarray:
+    """Return a list of numbers in JSON as float64 [n].
+
+    Args:
+      values: the list.
+      count: its length; None: at least 1.
+      name: what errors call it.
+      null: the number that null stands for; None: null is an error.
+
+    Raises:
+      ValueError: if it is anything else, or a number is beyond the range of float32.
+    """
+
+    def is_number(value: object) -> bool:
+        if value is None:
+            return null is not None
+        # Not isinstance, because JSON's true is an int in Python.
+        return type(value) in (int, float) and abs(value) <= LARGEST_FLOAT  # type: ignore[arg-type]
+
+    if (
+        not isinstance(values, list)
+        or count not in (None, len(values))
+        or not values
+        or not all(map(is_number, values))
+    ):
+        wanted = f"{count or 'a list of'} finite numbers{'' if null is None else ' or null'}"
+        raise ValueError(f"{name} must be {wanted}; got {shortened(values)}")
+    return np.array([null if value is None else value for value in values], np.float64)
 
 
 @contextlib.contextmanager
@@ -93,7 +129,8 @@ def check_model(model: Model) -> None:
     check_bounded("appearance", model.appearance)
     if not (np.abs(model.background) <= LARGEST_NUMBER).all():  # False for NaN.
         raise ValueError(f"background must be finite, within ±{LARGEST_NUMBER:g}; got {model.background}")
-    if (largest := np.asarray(gaussians.log_scales).max(initial=-np.inf)) > LARGEST_LOG_SCALE:
+    largest = np.asarray(gaussians.log_scales).max(initial=-np.inf)
+    if largest > LARGEST_LOG_SCALE:
         raise ValueError(
             f"gaussians.log_scales must be logarithms of finite scales, up to {LARGEST_LOG_SCALE:.2f}, of scales up to "
             f"{LARGEST_NUMBER:g}; got {largest:g}"
@@ -121,36 +158,37 @@ def check_origin(origin: Origin) -> None:
 
 def check_finite(name: str, tree: object, *, is_signed: bool = True) -> None:
     """Raise ValueError, naming the leaf, if a float of a pytree is NaN or infinite or, unsigned, NaN or negative."""
-    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
-        values = np.asarray(leaf)
-        if not np.issubdtype(values.dtype, np.floating):
-            continue
+    for leaf, values in _float_rows(name, tree):
         # `values >= 0` is False for NaN.
-        is_good = np.atleast_1d(np.isfinite(values) if is_signed else values >= 0)
+        is_good: np.ndarray = np.all(np.isfinite(values) if is_signed else values >= 0, axis=1)
         if not is_good.all():
-            wanted, found = ("finite", "NaN or infinite") if is_signed else ("at least 0", "negative or NaN")
-            bad = np.flatnonzero(~is_good.all(axis=tuple(range(1, is_good.ndim))))
+            wanted = "finite" if is_signed else "at least 0"
+            unwanted = "NaN or infinite" if is_signed else "negative or NaN"
+            bad = np.flatnonzero(~is_good)
             raise ValueError(
-                f"{name}{jax.tree_util.keystr(path)} must be {wanted}; {len(bad):,} of {len(is_good):,} rows have "
-                f"{found} numbers, the first is row {bad[0]:,} (from 0)"
+                f"{leaf} must be {wanted}; {len(bad):,} of {len(is_good):,} rows have {unwanted} numbers, the first is "
+                f"row {bad[0]:,} (from 0)"
             )
 
 
 def check_bounded(name: str, tree: object) -> None:
     """Raise ValueError, naming the leaf and the number, if a float is not finite or too large."""
     check_finite(name, tree)
-    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
-        values = np.asarray(leaf)
-        if not np.issubdtype(values.dtype, np.floating):
-            continue
-        # Scalars count as one row.
-        is_large = np.atleast_1d(np.abs(values) > LARGEST_NUMBER)
+    for leaf, values in _float_rows(name, tree):
+        is_large = np.abs(values) > LARGEST_NUMBER
         if is_large.any():
-            row = np.flatnonzero(is_large.any(axis=tuple(range(1, is_large.ndim))))[0]
+            row, column = np.argwhere(is_large)[0]
             raise ValueError(
-                f"{name}{jax.tree_util.keystr(path)} must be within ±{LARGEST_NUMBER:g}; got "
-                f"{np.atleast_1d(values)[is_large][0]:g} in row {row:,} (from 0)"
+                f"{leaf} must be within ±{LARGEST_NUMBER:g}; got {values[row, column]:g} in row {row:,} (from 0)"
             )
+
+
+def _float_rows(name: str, tree: object) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield the name and the numbers [N, C] of each leaf of floats; a scalar is one row."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        values = np.atleast_1d(np.asarray(leaf))
+        if np.issubdtype(values.dtype, np.floating):
+            yield f"{name}{jax.tree_util.keystr(path)}", values.reshape(len(values), math.prod(values.shape[1:]))
 
 
 def check_count(name: str, value: object, most: int) -> None:

@@ -77,7 +77,8 @@ def encode_web_scene(
 
 def importance(model: Model) -> np.ndarray:
     """Return [N] opacity times the mean area in the cameras' views; without cameras, times the area itself."""
-    gaussians, origin = model.gaussians, model.origin
+    gaussians = model.gaussians
+    origin = model.origin
     # log s_u + log s_v.
     log_areas = np.asarray(gaussians.log_scales, np.float64).sum(axis=1)
     areas: np.ndarray = opacities_of(np.asarray(gaussians.logit_opacities)) * np.exp(log_areas)

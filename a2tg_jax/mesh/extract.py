@@ -33,8 +33,10 @@ GRID_BYTES = 4 * 10**9
 RADII = 2.0
 """Default radius, in median distances of the cameras from the centre."""
 LEAST_WEIGHT = 0.05
-MOST_CLUSTERS, LEAST_FACES = 50, 50
-"""Default number and size of the connected parts to keep, as in 2DGS."""
+MOST_CLUSTERS = 50
+"""Default number of connected parts to keep, as in 2DGS."""
+LEAST_FACES = 50
+"""Default number of faces of the smallest of them, as in 2DGS."""
 BRICK = 16
 """Blocks along a side of a brick; marching cubes run brick by brick."""
 SAME = 1e-3
@@ -127,16 +129,21 @@ def extract_mesh(
         raise ValueError(f"max_bytes must be positive and finite; got {max_bytes}")
     if most_clusters < 1:
         raise ValueError(f"most_clusters must be at least 1; got {most_clusters}")
-    renderer, depths_of = Renderer(model, cameras=cameras, settings=settings), jax.jit(rendered_depth)
-    own_center, own_radius = common_sphere([camera.viewmat for camera in cameras], center)
-    if not own_radius:  # Cameras in one place: the centre is at the median depth of the first.
+    renderer = Renderer(model, cameras=cameras, settings=settings)
+    depths_of = jax.jit(rendered_depth)
+    common_center, common_radius = common_sphere([camera.viewmat for camera in cameras], center)
+    if not common_radius:  # Cameras in one place: the centre is at the median depth of the first.
         depth = np.asarray(depths_of(renderer(cameras[0]), cameras[0]).depth)
         middle = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
-        own_center, own_radius = own_center + middle * np.asarray(cameras[0].viewmat, float)[2, :3], RADII * middle
-    center = own_center if center is None else np.asarray(center, np.float64)
-    radius = own_radius if radius is None else radius
-    voxel = radius / (resolution or RESOLUTION) if voxel is None else voxel
-    space, grid = Space.of(center, radius, voxel, unbounded), BlockGrid(max_bytes)
+        common_center = common_center + middle * np.asarray(cameras[0].viewmat, float)[2, :3]
+        common_radius = RADII * middle
+    center = common_center if center is None else np.asarray(center, np.float64)
+    if radius is None:
+        radius = common_radius
+    if voxel is None:
+        voxel = radius / (resolution or RESOLUTION)
+    space = Space.of(center, radius, voxel, unbounded)
+    grid = BlockGrid(max_bytes)
     for index, camera in enumerate(progress_over(cameras, "fusing", "view", is_shown=progress)):
         try:
             fuse(grid, depths_of(renderer(camera), camera), space)
@@ -157,8 +164,8 @@ def extract_mesh(
             "there is no surface within the radius around the point that the cameras look at: give a larger `radius`, "
             "or `unbounded`"
         )
-    facts = center, radius, voxel, len(cameras), num_dropped, grid.num_bytes
-    return MeshResult(mesh, *facts, seconds=time.perf_counter() - start)
+    seconds = time.perf_counter() - start
+    return MeshResult(mesh, center, radius, voxel, len(cameras), num_dropped, grid.num_bytes, seconds)
 
 
 def check_lengths(resolution: int | None, voxel: float | None, radius: float | None) -> None:
@@ -178,12 +185,12 @@ def common_sphere(viewmats: ArrayLike, center: ArrayLike | None = None) -> tuple
     The centre is the point nearest to all optical axes unless it is given, the radius twice the median distance of the
     cameras from it. Cameras far from all others do not count.
     """
-    given = np.asarray(viewmats, np.float64)
-    counted = given[~outlying_cameras(given)]
-    centers = camera_centers(counted)
+    matrices = np.asarray(viewmats, np.float64)
+    matrices = matrices[~outlying_cameras(matrices)]
+    centers = camera_centers(matrices)
     if center is None:
         # Row 2 of a rotation is the optical axis in the world.
-        center = nearest_point(centers, counted[:, 2, :3]) if len(counted) > 1 else centers[0]
+        center = nearest_point(centers, matrices[:, 2, :3]) if len(matrices) > 1 else centers[0]
     center = np.asarray(center, np.float64)
     return center, float(RADII * np.median(np.linalg.norm(centers - center, axis=1)))
 
@@ -197,11 +204,13 @@ def surface_of(grid: BlockGrid, space: Space, least_weight: float = 0.0) -> Mesh
     parts = list(_parts(grid, least_weight))
     if not parts:
         return Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.uint8))
+    of_vertices, of_faces, of_colors = zip(*parts, strict=True)
     # Faces of a brick count its own vertices from 0.
-    starts = np.cumsum([0, *(len(vertices) for vertices, _, _ in parts[:-1])])
-    vertices = np.concatenate([vertices for vertices, _, _ in parts])
-    faces = np.concatenate([faces + start for (_, faces, _), start in zip(parts, starts, strict=True)])
-    colors = np.concatenate([colors for _, _, colors in parts])
+    ends = np.cumsum([len(vertices) for vertices in of_vertices])
+    starts = [0, *ends[:-1]]
+    faces = np.concatenate([faces + start for faces, start in zip(of_faces, starts, strict=True)])
+    vertices = np.concatenate(of_vertices)
+    colors = np.concatenate(of_colors)
     # Vertices shared by two bricks are merged, and faces that collapse are dropped.
     side = BRICK * SIDE
     # Only vertices on the faces of bricks can be shared: the tree stays small.
@@ -213,7 +222,8 @@ def surface_of(grid: BlockGrid, space: Space, least_weight: float = 0.0) -> Mesh
         # Labels are 0 to n − 1, so that they are the new indices.
         _, first = np.unique(labels, return_index=True)
         a, b, c = labels[faces].T
-        vertices, colors = vertices[first], colors[first]
+        vertices = vertices[first]
+        colors = colors[first]
         faces = labels[faces][(a != b) & (b != c) & (a != c)]
     positions = np.asarray(space.positions(jnp.asarray(vertices, jnp.float32)))
     return Mesh(positions, faces.astype(np.int32), colors)
@@ -226,13 +236,14 @@ def _parts(grid: BlockGrid, least_weight: float) -> Iterator[tuple[np.ndarray, n
     blocks = np.stack(np.meshgrid(*[np.arange(BRICK + 1)] * 3, indexing="ij"), -1).reshape(-1, 3)
     for brick in np.unique(grid.coordinates // BRICK, axis=0):
         rows = grid.find(brick * BRICK + blocks)
-        found = np.flatnonzero(rows >= 0)
-        rows = rows[found]
+        places = np.flatnonzero(rows >= 0)
+        rows = rows[places]
         weight = grid.weight[rows]
         known = weight > least_weight
         # 1, a truncation in front of any surface, where nothing is known.
         mean = np.where(known, grid.distance[rows] / np.where(known, weight, 1.0), 1.0)
-        distance, is_known = _dense(mean.astype(np.float32), found, 1.0), _dense(known, found, False)
+        distance = _dense(mean.astype(np.float32), places, 1.0)
+        is_known = _dense(known, places, False)
         for axis in range(3):  # A cell is known if its eight corners are; the mask has it at its last corner.
             is_known &= np.roll(is_known, 1, axis)
             is_known[(slice(None),) * axis + (0,)] = False
@@ -247,12 +258,13 @@ def _parts(grid: BlockGrid, least_weight: float) -> Iterator[tuple[np.ndarray, n
         color = np.rint(255 * np.clip(grid.color[rows].astype(np.float32), 0, 1)).astype(np.uint8)
         nearest = tuple(np.rint(vertices).astype(int).T)
         # float64: indices of far bricks leave float32 too few digits to match borders.
-        yield vertices.astype(np.float64) + brick * (BRICK * SIDE), faces, _dense(color, found, 0)[nearest]
+        yield vertices.astype(np.float64) + brick * (BRICK * SIDE), faces, _dense(color, places, 0)[nearest]
 
 
 def _dense(values: np.ndarray, places: np.ndarray, empty: float) -> np.ndarray:
     """Return blocks of values [B, VOXELS, ...] as one array of a brick's voxels and the first ones of the next."""
-    num, channels = BRICK + 1, values.shape[2:]
+    num = BRICK + 1
+    channels = values.shape[2:]
     whole = np.full((num**3, VOXELS, *channels), empty, values.dtype)
     whole[places] = values
     whole = whole.reshape(num, num, num, SIDE, SIDE, SIDE, *channels)

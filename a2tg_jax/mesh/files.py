@@ -70,24 +70,29 @@ def save_mesh(path: str | os.PathLike[str], mesh: Mesh, transform: Similarity | 
         _save_glb(path, mesh, transform)
         return [path]
     # Mesh.transform returns float64, which map coordinates need.
-    transform = transform.transform if isinstance(transform, Origin) else transform
-    mesh = mesh if transform is None else mesh.transform(transform.inverse())
+    if isinstance(transform, Origin):
+        transform = transform.transform
+    if transform is not None:
+        mesh = mesh.transform(transform.inverse())
     if suffix == ".obj":
         return _save_obj(path, mesh)
     kind = "<f8" if _needs_doubles(mesh.vertices) else "<f4"
-    columns: list[tuple[str, str, np.ndarray]] = [(n, kind, c) for n, c in zip("xyz", mesh.vertices.T, strict=True)]
+    word = "float" if kind == "<f4" else "double"
+    fields: list[Any] = [("positions", kind, 3)]
+    properties = [f"property {word} {axis}" for axis in "xyz"]
     if mesh.colors is not None:
-        columns += [(n, "u1", c) for n, c in zip(("red", "green", "blue"), mesh.colors.T, strict=True)]
-    rows = np.empty(mesh.num_vertices, [(name, dtype) for name, dtype, _ in columns])
-    for name, _, values in columns:
-        rows[name] = values
+        fields.append(("colors", "u1", 3))
+        properties += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
+    rows = np.empty(mesh.num_vertices, fields)
+    rows["positions"] = mesh.vertices
+    if mesh.colors is not None:
+        rows["colors"] = mesh.colors
     # A list property is a count, then as many indices.
     faces = np.empty(mesh.num_faces, [("number", "u1"), ("corners", "<i4", 3)])
-    faces["number"], faces["corners"] = 3, mesh.faces
-    words = {"<f4": "float", "<f8": "double", "u1": "uchar"}
+    faces["number"] = 3
+    faces["corners"] = mesh.faces
     header = [
-        "ply", "format binary_little_endian 1.0", f"element vertex {mesh.num_vertices}",
-        *(f"property {words[dtype]} {name}" for name, dtype, _ in columns),
+        "ply", "format binary_little_endian 1.0", f"element vertex {mesh.num_vertices}", *properties,
         f"element face {mesh.num_faces}", "property list uchar int vertex_indices", "end_header", "",
     ]  # fmt: skip
     write_whole(path, "\n".join(header).encode() + rows.tobytes() + faces.tobytes())
@@ -96,13 +101,15 @@ def save_mesh(path: str | os.PathLike[str], mesh: Mesh, transform: Similarity | 
 
 def _needs_doubles(vertices: np.ndarray) -> bool:
     """Return whether float32 would round positions by more than 1e-5 of their extent, such as far from the origin."""
-    largest, extent = np.abs(vertices).max(initial=0), np.ptp(vertices, axis=0).max() if len(vertices) else 0
+    largest = np.abs(vertices).max(initial=0)
+    extent = np.ptp(vertices, axis=0).max() if len(vertices) else 0
     return bool(largest * np.finfo(np.float32).eps > 1e-5 * extent)
 
 
 def _save_obj(path: Path, mesh: Mesh) -> list[Path]:
     """Write an OBJ file, with a material and a picture if there is a texture."""
-    lines, written = ["# triangles"], mesh_files(path, has_texture=mesh.texture is not None)
+    lines = ["# triangles"]
+    written = mesh_files(path, has_texture=mesh.texture is not None)
     if mesh.texture is not None:
         _, material, picture = written
         lines += [f"mtllib {material.name}", "usemtl texture"]
@@ -181,6 +188,7 @@ def _save_glb(path: Path, mesh: Mesh, origin: Similarity | Origin | None) -> Non
 
 def _middle(vertices: np.ndarray) -> np.ndarray:
     """Return the middle of positions far from the origin; otherwise zeros."""
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    low = vertices.min(axis=0)
+    high = vertices.max(axis=0)
     middle = (low + high) / 2
     return middle if np.abs(middle).max() > FAR * (high - low).max() else np.zeros(3)

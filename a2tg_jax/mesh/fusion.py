@@ -109,7 +109,8 @@ class BlockGrid:
         self.capacity = max(1, int(max_bytes) // BYTES_PER_BLOCK)
         # Weighted sums of distances, in units of the truncation, and sums of their weights.
         # np.zeros reserves address space only: pages take memory when blocks are written.
-        self.distance, self.weight = (np.zeros((self.capacity, VOXELS), np.float32) for _ in range(2))
+        self.distance = np.zeros((self.capacity, VOXELS), np.float32)
+        self.weight = np.zeros((self.capacity, VOXELS), np.float32)
         # Mean colours, and sums of their weights.
         self.color = np.zeros((self.capacity, VOXELS, 3), np.float16)
         self.color_weight = np.zeros((self.capacity, VOXELS), np.float32)
@@ -131,7 +132,8 @@ class BlockGrid:
         if len(blocks):  # Neighbouring pixels mostly repeat a block, and sorting is slow.
             blocks = blocks[np.r_[True, (blocks[1:] != blocks[:-1]).any(axis=1)]]
         keys = np.unique(_keys_of(blocks[((blocks > -LIMIT) & (blocks < LIMIT)).all(axis=1)]))
-        num, new = len(self._rows), [key for key in keys.tolist() if key not in self._rows]
+        num = len(self._rows)
+        new = [key for key in keys.tolist() if key not in self._rows]
         if num + len(new) > self.capacity:
             raise GridFullError(f"there is room for no more than {self.capacity:,} blocks of voxels")
         self._rows |= zip(new, range(num, num + len(new)), strict=True)
@@ -208,14 +210,16 @@ def _fused(voxels: list[Array], blocks: Array, depths: RenderedDepth, space: Spa
     points = space.positions((blocks[:, None] * SIDE + LOCAL[None]).reshape(-1, 3))
     truncation = TRUNCATION * space.voxel * space.scale(points)
     # Written out: XLA is tens of times slower at multiplying many rows by a 3 × 3 matrix.
-    viewmat, K = depths.camera.viewmat, depths.camera.K
     across, down, z = (
-        row[0] * points[:, 0] + row[1] * points[:, 1] + row[2] * points[:, 2] + row[3] for row in viewmat[:3]
+        row[0] * points[:, 0] + row[1] * points[:, 1] + row[2] * points[:, 2] + row[3]
+        for row in depths.camera.viewmat[:3]
     )
     is_ahead = z > 0
     ahead = jnp.where(is_ahead, z, 1.0)
     # Points behind the camera are far outside of the image.
-    x, y = (jnp.where(is_ahead, (row[0] * across + row[1] * down) / ahead + row[2], -1e6) for row in K[:2])
+    x, y = (
+        jnp.where(is_ahead, (row[0] * across + row[1] * down) / ahead + row[2], -1e6) for row in depths.camera.K[:2]
+    )
     seen, is_seen = _depths_at(depths.depth, x, y, truncation)
     pixel = _pixels(x, y, *depths.depth.shape)
     spread, slant, facing = (image.reshape(-1)[pixel] for image in (depths.spread, depths.slant, depths.facing))
@@ -224,16 +228,18 @@ def _fused(voxels: list[Array], blocks: Array, depths: RenderedDepth, space: Spa
     behind = jnp.clip((1 + signed) / (1 - 1 / TRUNCATION), 0.0, 1.0)
     sure = facing**2 * behind / (1 + (spread / (SURE * truncation)) ** 2)
     # Voxels deeper than a truncation behind the surface are hidden, and unknown to this view.
-    own = jnp.where(is_seen & is_ahead & (signed >= -1), sure, 0.0).reshape(-1, VOXELS)
-    distance = distance + own * jnp.minimum(signed, 1.0).reshape(-1, VOXELS)
+    added = jnp.where(is_seen & is_ahead & (signed >= -1), sure, 0.0).reshape(-1, VOXELS)
+    distance = distance + added * jnp.minimum(signed, 1.0).reshape(-1, VOXELS)
     # Colours count near the surface only, not in the free space before it.
-    near = jnp.where(signed.reshape(-1, VOXELS) < 1, own, 0.0)
+    near = jnp.where(signed.reshape(-1, VOXELS) < 1, added, 0.0)
     color_weight = color_weight + near
-    share, mean = near / jnp.maximum(color_weight, 1e-12), color.astype(jnp.float32)
-    # Channel by channel, which keeps arrays of three numbers a row out of the loops over voxels.
-    shown = [depths.color[..., channel].reshape(-1)[pixel].reshape(share.shape) for channel in range(3)]
-    mixed = [mean[..., channel] + share * (shown[channel] - mean[..., channel]) for channel in range(3)]
-    return distance, weight + own, jnp.stack(mixed, -1).astype(jnp.float16), color_weight
+    share = near / jnp.maximum(color_weight, 1e-12)
+    mixed = []
+    for channel in range(3):  # Channel by channel: arrays of three numbers a row stay out of the loops over voxels.
+        mean = color[..., channel].astype(jnp.float32)
+        shown = depths.color[..., channel].reshape(-1)[pixel].reshape(share.shape)
+        mixed.append(mean + share * (shown - mean))
+    return distance, weight + added, jnp.stack(mixed, -1).astype(jnp.float16), color_weight
 
 
 def _depths_at(depth: Array, x: Array, y: Array, truncation: Array) -> tuple[Array, Array]:
@@ -245,8 +251,10 @@ def _depths_at(depth: Array, x: Array, y: Array, truncation: Array) -> tuple[Arr
     height, width = depth.shape
     flat = depth.reshape(-1)
     # Pixel centres are at half-integers.
-    left, top = jnp.floor(x - 0.5), jnp.floor(y - 0.5)
-    right, below = x - 0.5 - left, y - 0.5 - top
+    left = jnp.floor(x - 0.5)
+    top = jnp.floor(y - 0.5)
+    right = x - 0.5 - left
+    below = y - 0.5 - top
     a, b, c, d = (flat[_pixels(left + dx, top + dy, height, width)] for dy in (0.5, 1.5) for dx in (0.5, 1.5))
     nearest = jnp.where(below < 0.5, jnp.where(right < 0.5, a, b), jnp.where(right < 0.5, c, d))
     least = jnp.minimum(jnp.minimum(a, b), jnp.minimum(c, d))

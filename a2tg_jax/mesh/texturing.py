@@ -20,7 +20,8 @@ CHUNK = 1 << 20
 """Texels projected at a time, and pixels tested at a time."""
 PADDING = 2
 """Texels between charts."""
-SMALLEST_SIDE, LARGEST_SIDE = 16, 8_192
+SMALLEST_SIDE = 16
+LARGEST_SIDE = 8_192
 NEAR = 1e-3
 """Smallest depth of a corner of a face that is drawn, in units of the median depth."""
 
@@ -56,11 +57,12 @@ def texture_mesh(mesh: Mesh, pictures: Iterable[Picture], *, size: int = 2048) -
         depth = draw_view(mesh, camera).depth
         for start in range(0, len(weight), CHUNK):
             part = Texels(*(rows[start : start + CHUNK] for rows in texels))
-            seen, own, color = _seen(part, camera, np.asarray(picture, np.float32), mask, depth)
-            weight[start + seen] += own
-            total[start + seen] += own[:, None] * color
+            seen, weights, color = _seen(part, camera, np.asarray(picture, np.float32), mask, depth)
+            weight[start + seen] += weights
+            total[start + seen] += weights[:, None] * color
     color = np.where(weight[:, None] > 0, total / np.maximum(weight, 1e-30)[:, None], texels.color)
-    atlas, is_empty = np.zeros((size, size, 3), np.uint8), np.ones((size, size), bool)
+    atlas = np.zeros((size, size, 3), np.uint8)
+    is_empty = np.ones((size, size), bool)
     atlas.reshape(-1, 3)[texels.place] = np.rint(255 * np.clip(color, 0, 1))
     is_empty.flat[texels.place] = False
     if not is_empty.all():  # Between charts, the nearest texel's colour keeps seams from showing.
@@ -87,22 +89,28 @@ class Texels(NamedTuple):
 def _unwrapped(mesh: Mesh, size: int) -> tuple[Mesh, Texels]:
     """Return the mesh with positions in a square atlas of `size`, by xatlas, and the texels that its charts cover."""
     xatlas = check_texture(size)
-    atlas, pack = xatlas.Atlas(), xatlas.PackOptions()
+    atlas = xatlas.Atlas()
     atlas.add_mesh(np.ascontiguousarray(mesh.vertices, np.float32), np.ascontiguousarray(mesh.faces, np.uint32))
-    pack.resolution, pack.padding, pack.bruteForce = size, PADDING, False
-    atlas.generate(xatlas.ChartOptions(), pack)
+    options = xatlas.PackOptions()
+    options.resolution = size
+    options.padding = PADDING
+    options.bruteForce = False
+    atlas.generate(xatlas.ChartOptions(), options)
     source, faces, uv = atlas.get_mesh(0)
-    own = None if mesh.colors is None else mesh.colors[source]
-    mesh = Mesh(mesh.vertices[source], faces.astype(np.int32), own, uv := np.asarray(uv, np.float32))
+    colors = None if mesh.colors is None else mesh.colors[source]
+    uv = np.asarray(uv, np.float32)
+    mesh = Mesh(mesh.vertices[source], faces.astype(np.int32), colors, uv)
     # uv begins at the lower left, rows of the atlas at the top.
     corners = (uv * (size, -size) + (0, size)).astype(np.float32)[mesh.faces]
     # At one depth: charts do not overlap.
     drawn = _draw(corners, np.ones(mesh.faces.shape, np.float32), size, size)
     place = np.flatnonzero(drawn.face >= 0)
-    hit, weights = drawn.face.reshape(-1)[place], drawn.weights.reshape(-1, 3)[place]
+    hit = drawn.face.reshape(-1)[place]
+    weights = drawn.weights.reshape(-1, 3)[place]
     normals = mesh.face_normals[hit]
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-    colors = np.full((mesh.num_vertices, 3), 128, np.uint8) if own is None else own
+    if colors is None:
+        colors = np.full((mesh.num_vertices, 3), 128, np.uint8)
     position, color = (
         np.einsum("tk,tkc->tc", weights, rows[mesh.faces[hit]].astype(np.float32)) for rows in (mesh.vertices, colors)
     )
@@ -114,12 +122,14 @@ def _seen(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the texels visible in a view, as indices [S], and their weights [S] and colours [S, 3] there. Those beyond
     the mesh's depth [H, W] are hidden."""
-    viewmat, K = np.asarray(camera.viewmat, np.float32), np.asarray(camera.K, np.float32)
+    viewmat = np.asarray(camera.viewmat, np.float32)
+    K = np.asarray(camera.K, np.float32)
     at = texels.position @ viewmat[:3, :3].T + viewmat[:3, 3]
     # In camera axes: distance times the cosine between normal and the direction to the camera.
     toward = -np.sum(at * (texels.normal @ viewmat[:3, :3].T), axis=1)
     seen = np.flatnonzero((at[:, 2] > 0) & (toward > 0))
-    at, toward = at[seen], toward[seen]
+    at = at[seen]
+    toward = toward[seen]
     x, y = ((at / at[:, 2:]) @ K[:2].T).T
     distance = np.linalg.norm(at, axis=1)
     is_inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height) & (toward > LEAST_FACING * distance)
@@ -133,8 +143,8 @@ def _seen(
     channels = [map_coordinates(picture[..., channel], places, order=1, mode="nearest") for channel in range(3)]
     distance = distance[is_seen]
     # cosine·focal length/distance: `toward` is the cosine times the distance.
-    own = (toward[is_seen] * K[0, 0] / camera.width / distance**2) ** POWER
-    return seen[is_seen], own.astype(np.float32), np.stack(channels, -1)
+    weights = (toward[is_seen] * K[0, 0] / camera.width / distance**2) ** POWER
+    return seen[is_seen], weights.astype(np.float32), np.stack(channels, -1)
 
 
 # Triangles drawn into pixels
@@ -150,7 +160,8 @@ class Raster(NamedTuple):
 
 def draw_view(mesh: Mesh, camera: Camera) -> Raster:
     """Draw a mesh in a camera's view, without faces that reach behind the camera."""
-    viewmat, K = np.asarray(camera.viewmat, np.float64), np.asarray(camera.K, np.float64)
+    viewmat = np.asarray(camera.viewmat, np.float64)
+    K = np.asarray(camera.K, np.float64)
     at = mesh.vertices @ viewmat[:3, :3].T + viewmat[:3, 3]
     z = at[:, 2]
     # Faces at the camera plane would have infinite pixels.
@@ -167,22 +178,25 @@ def _draw(points: np.ndarray, depths: np.ndarray, width: int, height: int) -> Ra
     weights = np.zeros((width * height, 3), np.float32)
     for faces, pixels in _candidates(points, width, height):
         a, b, c = points[faces].transpose(1, 0, 2)
-        along, across = b - a, c - a
+        along = b - a
+        across = c - a
         place = np.stack([pixels % width, pixels // width], -1) + np.float32(0.5) - a
         area = along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]
         with np.errstate(divide="ignore", invalid="ignore"):  # Triangles without area become NaN and cover no pixels.
             second = (place[:, 0] * across[:, 1] - place[:, 1] * across[:, 0]) / area
             third = (along[:, 0] * place[:, 1] - along[:, 1] * place[:, 0]) / area
-            own = np.stack([1 - second - third, second, third], -1)  # Barycentric coordinates.
-        depth = 1 / np.sum(own / depths[faces], axis=1)  # Inverse depths are linear in the image.
-        shows = np.flatnonzero((own >= 0).all(axis=1) & (depth < nearest[pixels]))
+            barycentric = np.stack([1 - second - third, second, third], -1)
+        depth = 1 / np.sum(barycentric / depths[faces], axis=1)  # Inverse depths are linear in the image.
+        shows = np.flatnonzero((barycentric >= 0).all(axis=1) & (depth < nearest[pixels]))
         shows = shows[np.argsort(-depth[shows], kind="stable")]  # The nearest is written last.
         chosen = pixels[shows]
-        face[chosen], nearest[chosen], weights[chosen] = faces[shows], depth[shows], own[shows]
+        face[chosen] = faces[shows]
+        nearest[chosen] = depth[shows]
+        weights[chosen] = barycentric[shows]
     # Perspective: what is linear on the triangle is linear over depth in the image.
     corrected = weights / np.where(face[:, None] >= 0, depths[face], 1.0)
     corrected /= np.maximum(corrected.sum(axis=1, keepdims=True), 1e-30)
-    shape = height, width
+    shape = (height, width)
     return Raster(face.reshape(shape), corrected.reshape(*shape, 3).astype(np.float32), nearest.reshape(shape))
 
 
@@ -193,7 +207,8 @@ def _candidates(points: np.ndarray, width: int, height: int) -> Iterator[tuple[n
         low = np.maximum(np.ceil(points.min(axis=1) - 0.5), 0)
         high = np.minimum(np.floor(points.max(axis=1) - 0.5), (width - 1, height - 1))
         order = np.flatnonzero((high >= low).all(axis=1))
-    low, span = low[order].astype(np.int64), (high[order] - low[order] + 1).astype(np.int64)
+    low = low[order].astype(np.int64)
+    span = high[order].astype(np.int64) - low + 1
     areas = span.prod(axis=1)
     ends = np.cumsum(areas)
     # Chunks of whole faces, so that arrays stay bounded, however large faces are in the image.
@@ -203,6 +218,7 @@ def _candidates(points: np.ndarray, width: int, height: int) -> Iterator[tuple[n
         end = max(start + 1, int(np.searchsorted(ends, done + CHUNK, side="right")))
         rows = np.repeat(np.arange(start, end), areas[start:end])
         index = done + np.arange(len(rows)) - (ends - areas)[rows]  # Number of the pixel within its face's bounds.
-        x, y = low[rows, 0] + index % span[rows, 0], low[rows, 1] + index // span[rows, 0]
-        yield order[rows], y * width + x
-        start, done = end, int(ends[end - 1])
+        row, column = np.divmod(index, span[rows, 0])
+        yield order[rows], (low[rows, 1] + row) * width + low[rows, 0] + column
+        start = end
+        done = int(ends[end - 1])

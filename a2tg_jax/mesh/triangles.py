@@ -73,7 +73,9 @@ class Mesh(NamedFields):
         return dataclasses.replace(self, vertices=self.vertices[kept], faces=faces, colors=colors, uv=uv)
 
     def __repr__(self) -> str:
-        kind = "with a texture" if self.texture is not None else "with colours" if self.colors is not None else "bare"
+        kind = "bare" if self.colors is None else "with colours"
+        if self.texture is not None:
+            kind = "with a texture"
         return f"Mesh({self.num_vertices:,} vertices, {self.num_faces:,} faces, {kind})"
 
 
@@ -83,7 +85,7 @@ def largest_clusters(mesh: Mesh, most: int, least_faces: int) -> tuple[Mesh, int
         return mesh, 0
     a, b, c = mesh.faces.T
     # Two edges of a triangle connect its three vertices.
-    edges = np.concatenate([a, b]), np.concatenate([b, c])
+    edges = (np.concatenate([a, b]), np.concatenate([b, c]))
     graph = coo_matrix((np.ones(len(edges[0]), bool), edges), [mesh.num_vertices] * 2)
     _, labels = connected_components(graph, directed=False)
     # By faces: one vertex of each, since all three have one label.
@@ -197,7 +199,8 @@ def sample_surface(mesh: Mesh, spacing: float, seed: int = 0) -> np.ndarray:
     wanted = np.ceil(areas.sum() / spacing**2) if len(areas) else 0
     if not wanted <= MOST_POINTS:
         raise ValueError(f"spacing {spacing:g} takes {wanted:.3g} points; give one for up to {MOST_POINTS:,}")
-    points = np.zeros((num := int(wanted), 3))
+    num = int(wanted)
+    points = np.zeros((num, 3))
     if not num:
         return points
     rng = np.random.default_rng(seed)
@@ -205,10 +208,12 @@ def sample_surface(mesh: Mesh, spacing: float, seed: int = 0) -> np.ndarray:
     # Stratified by area: one point in each of num equal parts.
     chosen = np.searchsorted(ends, (np.arange(num) + rng.uniform(size=num)) * (ends[-1] / num))
     # The root makes (1 − a, a·(1 − b), a·b) uniform in a triangle.
-    a, b = np.sqrt(rng.uniform(size=num)), rng.uniform(size=num)
+    a = np.sqrt(rng.uniform(size=num))
+    b = rng.uniform(size=num)
     # Rounding of the sum may lead beyond the last face.
     chosen = np.minimum(chosen, len(areas) - 1)
-    for part in (slice(start, start + CHUNK) for start in range(0, num, CHUNK)):
+    for start in range(0, num, CHUNK):
+        part = slice(start, start + CHUNK)
         weights = np.stack([1 - a[part], a[part] * (1 - b[part]), a[part] * b[part]], -1)
         points[part] = np.einsum("pk,pkc->pc", weights, mesh.vertices[mesh.faces[chosen[part]]])
     return points

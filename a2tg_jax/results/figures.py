@@ -281,19 +281,13 @@ def level_picture(model: Model, levels: np.ndarray, camera: Camera, settings: Re
         # Alpha factors stay: they shape the splats.
         buckets = tuple(bucket.at[..., :3].set(0.0) for bucket in model.textures.buckets)
         model = model.with_textures(dataclasses.replace(model.textures, buckets=buckets))
-    model = with_flat_colors(model, np.ones(model.gaussians.num, bool), colors)
-    output = Renderer(model, settings=settings, has_geometry=False)(camera)
+    sh = np.zeros_like(model.sh)
+    sh[:, 0] = colors
+    output = Renderer(model.with_sh(sh), settings=settings, has_geometry=False)(camera)
     behind = (1 - np.asarray(output.alpha))[..., None]
     # The render has its own background behind it, (1 − alpha) of it, which the squares replace.
     ground = _ground((camera.height, camera.width)) - np.asarray(model.background)
     return to_uint8(np.asarray(output.color) + behind * ground)
-
-
-def with_flat_colors(model: Model, is_chosen: np.ndarray, colors: np.ndarray) -> Model:
-    """Return a model whose marked Gaussians have coefficients of degree 0 only: `colors`, one for all or [N, 3]."""
-    sh = np.where(is_chosen[:, None, None], 0, model.sh)
-    sh[:, 0] = np.where(is_chosen[:, None], colors, sh[:, 0])
-    return model.with_sh(sh)
 
 
 def _is_hit(output: RenderOutput) -> np.ndarray:

@@ -32,8 +32,7 @@ from a2tg_jax.core.budget import MEGABYTE, budget_in_bytes, megabytes_of
 from a2tg_jax.data.load import SceneSource
 from a2tg_jax.host.atomic import write_whole
 from a2tg_jax.host.json_text import MOST_TOML_BYTES, parse_toml
-from a2tg_jax.host.regular_files import is_regular, read_regular
-from a2tg_jax.host.remote_files import checked_url, path_here
+from a2tg_jax.host.regular_files import expanded, is_regular, read_regular
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.io.config_json import changed_config, config_from_dict, config_to_dict, flatten_config, merged
 from a2tg_jax.io.model_rows import check_encodable
@@ -194,11 +193,10 @@ def compared_system(name: str, other: System, preset: str | None = None) -> Syst
 
 
 def scene_place(scene: str, folder: Path = Path()) -> str:
-    """Return the place of a scene as in run.toml: a URL, or a full path without links. Relative paths start from a
-    folder. Raises ValueError if a URL is invalid or holds a secret."""
-    here = path_here(scene)
+    """Return the place of a scene as in run.toml: a full path without links. Relative paths start from a folder.
+    Raises ValueError for a URL."""
     # Unlike Path.resolve, realpath accepts circular links.
-    return checked_url(scene) if here is None else os.path.realpath(folder / here)
+    return os.path.realpath(folder / expanded(scene))
 
 
 def read_run_file(path: Path) -> RunRecord:

@@ -13,7 +13,6 @@ from a2tg_jax.finish.tuning import ITERATIONS
 from a2tg_jax.host import signals
 from a2tg_jax.host.errors import error_text
 from a2tg_jax.host.machine import Devices
-from a2tg_jax.host.remote_files import is_url
 from a2tg_jax.io.formats import load_splats
 from a2tg_jax.io.model_file import load_model, number_in_file, save_model
 from a2tg_jax.model import Model
@@ -90,8 +89,7 @@ def begin_run(record: RunRecord, out: Path, options: RunOptions) -> RunResult:
     record.check()
     _check_batch_sizes(record, options)
     check_weights(options.lpips_weights)
-    # Neither is a folder here.
-    if not record.scene.is_built_in and not is_url(record.scene.path):
+    if not record.scene.is_built_in:
         check_apart(out, Path(record.scene.path))
     check_free(out, overwrite=options.overwrite)
     given = None if record.init is None else check_init(Path(record.init), out, record.options)

@@ -53,7 +53,7 @@ class Bytewise(TwoStages):
     a view_dependence_share of 0.23 is better."""
     exponents: LimitExponents = LimitExponents()
     """Lower limit of the exponents of kernels; 0: no limit."""
-    view_dependence_share: float = 0.1  # the best with shapes of kernels (experiments/NOTEBOOK.md)
+    view_dependence_share: float = 0.1  # the best with shapes of kernels
     """Share of the bytes for view dependence; 0: none."""
     view_dependence_rate: float = 2e-3
     """Adam's learning rate of the coefficients above base_degree."""

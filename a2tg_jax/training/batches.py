@@ -172,8 +172,7 @@ class PhotoStore:
         for index, kind in enumerate(order.kinds):
             self._of_kind.setdefault(kind, []).append(index)
         self._places = {index: place for found in self._of_kind.values() for place, index in enumerate(found)}
-        is_waiting = any(view.picture.is_remote for view in views)
-        self._ahead = Ahead(self._read, self.num_ahead, is_waiting=is_waiting)
+        self._ahead = Ahead(self._read, self.num_ahead)
         # All processes must launch the same program, so one without room makes all stream.
         self.is_resident = not any_process(mesh, not plan.is_resident)
 
@@ -223,12 +222,11 @@ class PhotoStore:
 class Ahead:
     """Threads that prepare the next batches in order."""
 
-    def __init__(self, load: Callable[[tuple[int, ...]], Photographs], num_ahead: int, *, is_waiting: bool = False):
+    def __init__(self, load: Callable[[tuple[int, ...]], Photographs], num_ahead: int):
         """`load` makes the batch of some views; its errors are raised where that batch is taken. Up to `num_ahead` are
-        ready before they are needed. If loading waits for object storage (`is_waiting`), each batch has a thread."""
+        ready before they are needed."""
         self._load = load
-        num = num_ahead if is_waiting else min(num_ahead, num_threads())
-        self._pool = ThreadPoolExecutor(num, thread_name_prefix="photographs")
+        self._pool = ThreadPoolExecutor(min(num_ahead, num_threads()), thread_name_prefix="photographs")
         self._batches: dict[int, Future[Photographs]] = {}
 
     def first(self, wanted: dict[int, tuple[int, ...]]) -> Photographs:

@@ -144,7 +144,7 @@ class Lab:
 
     @property
     def pages(self) -> Path:
-        """Return the folder of tables and pictures, and make it; some scenes alone have a folder of their own."""
+        """Return the folder of tables and charts, and make it; some scenes alone have a folder of their own."""
         folder = self.out / "partial" if self.is_partial else self.out
         folder.mkdir(parents=True, exist_ok=True)
         return folder
@@ -318,7 +318,7 @@ def argument_parser(description: str) -> argparse.ArgumentParser:
     add = parser.add_argument
     add("--scenes", type=Path, default=Path("scenes"), help="folder of the scenes that grids/scales.toml names")
     add("--scale", type=_scale, default="small", metavar=f"{{{','.join(SCALES)}}}",
-        help="full is the paper's, for a GPU; long has its options and length on small photographs; protocol, "
+        help="full is the paper's, for a GPU; long has its options and length on small photographs; claims, protocol, "
         "protocol160, paper160, full_size (for a GPU) and half_size are in PROTOCOL.md")  # fmt: skip
     add("--only", action="append", metavar="SCENE", help="run this scene of the scale only; may be repeated")
     add("--scene", action="append", type=Path, default=[], metavar="PATH",

@@ -15,9 +15,12 @@ import a2tg_jax as a2tg
 from a2tg_jax.core.gaussians import rotation_matrices
 from a2tg_jax.events import Now
 from a2tg_jax.mcmc import Noise, densify_times, perturb
+from a2tg_jax.rasterize.render_types import RenderOutput
 from a2tg_jax.systems.baselines import Gaussians2dMcmc
 from a2tg_jax.systems.two_stages import grown_by_mcmc, pruned
+from a2tg_jax.training.losses import live_mean
 from a2tg_jax.training.stage import Stage
+from a2tg_jax.training.terms import Target, Term, opacity
 
 LOW_PASS = 0.3
 """Variance in pixels² that is added to both axes on the screen."""
@@ -79,13 +82,26 @@ class EllipsoidNoise(Noise):
         return a2tg.Change(dataclasses.replace(model, gaussians=gaussians), moments, state)
 
 
+def mean_scale(model: a2tg.Model, target: Target, output: RenderOutput) -> Array:
+    """Return the mean scale, over all three axes, of the live Gaussians (3DGS-MCMC)."""
+    return live_mean(jnp.mean(model.appearance.scales(model.gaussians), axis=-1), model.live_count)
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Gaussians3dMcmc(Gaussians2dMcmc):
     """3DGS-MCMC with the options of plain 2D Gaussians by MCMC."""
+
+    weight: float = 0.0
+    """Weight of the mean opacity, and of the mean scale, in the loss (0.01 in 3DGS-MCMC)."""
 
     name: ClassVar[str] = "gaussians-3d-mcmc"
 
     def stages(self) -> tuple[Stage, ...]:
         _, growth = grown_by_mcmc(self.densify, self.budget_cap(1))
         events = EllipsoidNoise(), growth, *pruned(self.prune, self.stage1_iterations, densify_times)
-        return self.continued(self.growing_stage(events, Ellipsoids(), {"log_thickness": self.rates.log_scales}))
+        first = self.growing_stage(events, Ellipsoids(), {"log_thickness": self.rates.log_scales})
+        stages = self.continued(first)
+        if not self.weight:
+            return stages
+        weights = Term(opacity, self.weight), Term(mean_scale, self.weight)
+        return tuple(dataclasses.replace(stage, losses=(*stage.losses, *weights)) for stage in stages)

@@ -182,11 +182,15 @@ def _system(place: str, preset: str, method: Method, cell: Cell) -> a2tg.System:
 
 
 def seconds_of(job: Job, records: Mapping[str, Record]) -> float | None:
-    """Return the time of the steps of a job and of those before it; None if one has not been timed."""
+    """Return the training time of a job and of those before it; None if one has not been timed.
+
+    Records of before E6 have the time of their steps, without what happens between them.
+    """
     chain = [job]
     while chain[-1].start is not None:
         chain.append(chain[-1].start)
-    times = [records.get(one.key, {}).get("step_seconds") for one in chain]
+    found = [records.get(one.key, {}) for one in chain]
+    times = [record.get("training_seconds", record.get("step_seconds")) for record in found]
     return None if None in times else sum(times)
 
 

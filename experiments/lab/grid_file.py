@@ -13,7 +13,7 @@ from a2tg_jax.io.config_json import config_from_dict
 
 GRIDS = Path(__file__).resolve().parents[1] / "grids"
 SUFFIX = ".toml"
-SCALES = ("full", "full_size", "half_size", "long", "paper160", "protocol", "protocol160", "small", "smoke")
+SCALES = ("claims", "full", "full_size", "half_size", "long", "paper160", "protocol", "protocol160", "small", "smoke")
 ONE_BYTE = 1e-6
 """A byte in MB."""
 LEAST = {
@@ -73,6 +73,7 @@ class GridFile:
     at_equal_bytes: tuple[str, ...] = ()
     at_equal_time: tuple[str, ...] = ()
     variants: dict[str, Any] = dataclasses.field(default_factory=dict)
+    claims: dict[str, Any] | None = None
     full: dict[str, Any] | None = None
     full_size: dict[str, Any] | None = None
     half_size: dict[str, Any] | None = None

@@ -34,6 +34,7 @@ from a2tg_jax.training.options import own_options
 from a2tg_jax.training.registry import reference_of
 from lab.fingerprint import fingerprint, is_same_so_far
 from lab.scenes import few_views, from_random_points
+from lab.timing import TrainingTime
 from lab.versions import is_from_before
 
 TEST, VALIDATION = "test", "validation"
@@ -42,7 +43,7 @@ MOST_TRAIN_VIEWS = 16
 """Largest number of training views that are measured, evenly chosen."""
 DEFAULT_GAUSSIANS = 100_000
 """Assumed number of Gaussians of a system that sets no limit."""
-TIMES = ("seconds", "ms_per_step", "step_seconds", "fps")
+TIMES = ("seconds", "ms_per_step", "training_seconds", "fps")
 """Figures that count for a job that had its GPU or its cores to itself; None for others."""
 Record = dict[str, Any]
 """Figures of a finished job, in JSON."""
@@ -157,6 +158,10 @@ class Folders:
     def checkpoint(self, job: Job) -> Path:
         return self.work / "checkpoints" / f"{job.key}.npz"
 
+    def time_so_far(self, job: Job) -> Path:
+        """Return the file with the training time up to the checkpoint."""
+        return self.checkpoint(job).with_suffix(".json")
+
     def shared(self, job: Job) -> Path:
         """Return the file whose presence says that others ran on the job's GPU or cores, also in an earlier call."""
         return self.work / "shared" / job.key
@@ -191,35 +196,50 @@ def run_job(job: Job, folders: Folders, stop_at: float = math.inf) -> Record | N
         record = {**read_json(path), **_quality(scene, a2tg.load_model(model), folders)}
     else:
         try:
-            result = _train(job, folders, scene, stop_at)
+            result, seconds = _train(job, folders, scene, stop_at)
         except a2tg.Interrupted:
             return None
         a2tg.save_model(_ready(model), result.model)
         times = TIMES
-        record = {**_training_facts(job, scene, result), **_quality(scene, result.model, folders)}
+        facts = _training_facts(job, scene, result) | {"training_seconds": seconds}
+        record = {**facts, **_quality(scene, result.model, folders)}
         record["alone"] = not folders.shared(job).is_file()
     if folders.shared(job).is_file():
         record |= dict.fromkeys(times)
     write_json(_ready(path), record)
     folders.checkpoint(job).unlink(missing_ok=True)
+    folders.time_so_far(job).unlink(missing_ok=True)
     return record
 
 
-def _train(job: Job, folders: Folders, scene: a2tg.Scene, stop_at: float) -> a2tg.StageResult:
-    path = _ready(folders.checkpoint(job))
+def _train(job: Job, folders: Folders, scene: a2tg.Scene, stop_at: float) -> tuple[a2tg.StageResult, float | None]:
+    """Return the result of the stage, and its time without compilation; None for that if a program that did not keep
+    it had begun."""
+    path, time_path = _ready(folders.checkpoint(job)), folders.time_so_far(job)
     start = None if job.start is None else a2tg.load_model(folders.model(job.start))
-    return fit_stage(
-        scene,
-        job.system,
-        job.stage,
-        start,
-        resume=_load_checkpoint(path, job) if path.is_file() else None,
-        on_checkpoint=lambda checkpoint: a2tg.save_checkpoint(path, checkpoint),
-        checkpoint_every=max(500, job.iterations // 10),
-        progress=False,
-        is_stopped=lambda: time.monotonic() >= stop_at,
-        session=_session(),
-    )
+    checkpoint = _load_checkpoint(path, job) if path.is_file() else None
+    earlier = 0.0
+    if checkpoint is not None:
+        earlier = read_json(time_path) if time_path.is_file() else math.nan
+
+    def keep(checkpoint: a2tg.Checkpoint) -> None:
+        write_json(time_path, training.seconds)
+        a2tg.save_checkpoint(path, checkpoint)
+
+    with TrainingTime(earlier) as training:
+        result = fit_stage(
+            scene,
+            job.system,
+            job.stage,
+            start,
+            resume=checkpoint,
+            on_checkpoint=keep,
+            checkpoint_every=max(500, job.iterations // 10),
+            progress=False,
+            is_stopped=lambda: time.monotonic() >= stop_at,
+            session=_session(),
+        )
+    return result, None if math.isnan(training.seconds) else training.seconds
 
 
 @functools.cache
@@ -245,7 +265,7 @@ def _training_facts(job: Job, scene: a2tg.Scene, result: a2tg.StageResult) -> Re
         "stage": result.name, "iterations": job.iterations, "num": result.model.num, "mb": result.model.num_bytes / 1e6,
         "published_mb": result.model.num_published_bytes / 1e6, "sizes": texture_sizes(result.model),
         "seconds": result.seconds, "ms_per_step": milliseconds(result.history),
-        "step_seconds": step_seconds(result.history), "seed": job.system.seed, "views": job.views,
+        "seed": job.system.seed, "views": job.views,
         "commit": source_commit(), "device": jax.devices()[0].device_kind, "threads": num_threads(),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         **({"random_start": True} if job.random_start else {}),
@@ -283,17 +303,6 @@ def milliseconds(history: a2tg.History) -> float | None:
     short to tell."""
     paces = np.diff(history.seconds) / np.diff(history.iteration)
     return 1e3 * float(np.median(paces)) if len(paces) else None
-
-
-def step_seconds(history: a2tg.History) -> float:
-    """Return the time of all steps without compilation: each interval counts the median pace of nine around it."""
-    counts = np.diff(history.iteration)
-    paces = np.diff(history.seconds) / counts
-    if not len(paces):
-        return float(history.last_seconds)
-    padded = np.pad(paces, 4, mode="reflect") if len(paces) > 4 else np.full(len(paces) + 8, np.median(paces))
-    smooth = np.median(np.lib.stride_tricks.sliding_window_view(padded, 9), axis=1)
-    return float((smooth * counts).sum() + smooth[0] * history.iteration[0])
 
 
 def _ready(path: Path) -> Path:

@@ -19,6 +19,7 @@ def _gains(grid: Grid, results: Sequence[Result]) -> str:
     names = [method.label for method in (grid.reference, *grid.methods)]
     variants = [name for name in names if name.startswith(grid.reference.label)]
     others = [method.label + tables.EQUAL_BYTES for method in grid.at_equal_bytes]
+    others += [method.label + tables.EQUAL_TIME for method in grid.at_equal_time]
     others += [name for name in names if name not in variants]
     gains = "\n".join(tables.gains_table(results, variant, others) for variant in variants)
     return f"{gains}\n## Figures of every method\n\n{tables.figures_table(results)}"
@@ -98,5 +99,7 @@ STANDARD = (
     table_experiment("paper_degree_3", "The paper's comparison at its length, at degree 3 (PROTOCOL.md)."),
     table_experiment("paper_degree_0", "The paper's comparison at its length, at degree 0 (PROTOCOL.md)."),
     table_experiment("bytewise", "bytewise against the best plain method of each scene (PROTOCOL.md)."),
-    table_experiment("parts", "What each part of bytewise brings (PROTOCOL.md)."),
+    table_experiment("confirmation", "bytewise on captures that nothing was tuned on (PROTOCOL.md)."),
+    table_experiment("bytewise_parts", "What the present bytewise is without each of its parts (PROTOCOL.md)."),
+    table_experiment("parts", "What each part of the first version of bytewise brings (PROTOCOL.md)."),
 )

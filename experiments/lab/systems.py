@@ -4,12 +4,14 @@ import dataclasses
 from typing import ClassVar
 
 import a2tg_jax as a2tg
+from a2tg_jax.densify.placing import PlaceByError
 from a2tg_jax.densify.splitting import SplitByGradient
 from a2tg_jax.mcmc import FillingMcmc, densify_times
-from a2tg_jax.systems.baselines import Gaussians2dMcmc
+from a2tg_jax.systems.baselines import Gaussians2d, Gaussians2dMcmc
 from a2tg_jax.systems.bytewise import Bytewise
 from a2tg_jax.systems.two_stages import LimitExponents, grown_by_mcmc, kernels_of, pruned
 from a2tg_jax.training.stage import Stage
+from a2tg_jax.training.terms import Term, opacity
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -42,3 +44,39 @@ class BytewiseByMcmc(Bytewise):
         growth = FillingMcmc(self._num_gaussians())
         events = [growth if isinstance(event, SplitByGradient) else event for event in first.events]
         return dataclasses.replace(first, events=tuple(events)), second
+
+
+def with_weight_and_placing(first: Stage, weight: float, place: PlaceByError) -> Stage:
+    """Return a first stage with the weight on opacities and the new Gaussians of `bytewise`. These come after all other
+    events, up to the number of Gaussians that densification may reach."""
+    cap = max(event.most_gaussians or 0 for event in first.events)
+    events = (*first.events, dataclasses.replace(place, cap=cap))
+    return dataclasses.replace(first, events=events, losses=(*first.losses, Term(opacity, weight)))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PlacedMcmc(Gaussians2dMcmc):
+    """Plain 2D Gaussians by MCMC, with the weight on opacities and the new Gaussians of `bytewise`."""
+
+    fading_weight: float = Bytewise.fading_weight
+    place: PlaceByError = PlaceByError()
+
+    name: ClassVar[str] = "placed-mcmc"
+
+    def stages(self) -> tuple[Stage, ...]:
+        first, *others = super().stages()
+        return with_weight_and_placing(first, self.fading_weight, self.place), *others
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PlacedDensity(Gaussians2d):
+    """Plain 2D Gaussians by clone and split, with the weight on opacities and the new Gaussians of `bytewise`."""
+
+    fading_weight: float = Bytewise.fading_weight
+    place: PlaceByError = PlaceByError()
+
+    name: ClassVar[str] = "placed-density"
+
+    def stages(self) -> tuple[Stage, ...]:
+        first, *others = super().stages()
+        return with_weight_and_placing(first, self.fading_weight, self.place), *others

@@ -21,8 +21,8 @@ from lab.markdown import table as markdown
 from lab.scenes import SceneAt
 
 T = TypeVar("T")
-EQUAL_BYTES = ", equal bytes"
-"""End of the label of a method at the bytes of the reference."""
+EQUAL_BYTES, EQUAL_TIME = ", equal bytes", ", equal time"
+"""Ends of the labels of methods in the bytes, or in the training time, of the reference."""
 PAPER: dict[str, list[dict[str, Any]]] = read_json(Path(__file__).with_name("paper.json"))
 """The figures that the paper publishes, by table."""
 MISSING = "–"
@@ -139,11 +139,7 @@ def quality_tables(grid: Grid, results: Sequence[Result]) -> str:
             rows.append([label, iterations(own), num_gaussians(own), *shown, _mean_of_columns(by_column)])
         header = ["method", "iterations", "Gaussians", *(f"{column}: {QUALITY_AND_SIZE}" for column in columns)]
         size = f"**{num:,} Gaussians** of {grid.reference.label}" if budget is None else f"**{budget:g} MB**"
-        size += (
-            " (+ x %: bytes above those of as many plain Gaussians)"
-            if any(map(_overhead, ([r] for r in block)))
-            else ""
-        )
+        size += " (+ x %: more bytes than as many plain Gaussians)" if any(map(_overhead, ([r] for r in block))) else ""
         parts.append(f"{size}\n\n" + markdown([*header, f"mean: {QUALITY_AND_SIZE}"], rows))
     return "\n".join(parts)
 
@@ -158,7 +154,7 @@ def _quality_and_size(results: Sequence[Result], scenes: set[SceneAt]) -> str:
 
 
 def _overhead(results: Sequence[Result]) -> str:
-    """Return the bytes above those of as many plain Gaussians in percent; empty where bytes are given, not numbers."""
+    """Return the bytes on top of as many plain Gaussians in percent; empty where bytes are given, not numbers."""
     if any(result.run.equal or result.run.cell.budget is not None for result in results):
         return ""
     plain = mean(results, "num") * bytes_per_gaussian(PLAIN_DEGREE) / MEGABYTE

@@ -1,0 +1,164 @@
+"""The registered comparison of `bytewise`: its endpoints, and exploration (E6 of PROTOCOL.md)."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from findings import Row
+from lab import tables
+from lab.cli import Experiment, Lab
+from lab.grid import Grid, read_grid
+from lab.markdown import table
+from lab.statistics import Comparison, bootstrap, compare, holm
+from lab.tables import EQUAL_TIME, Result
+
+BYTEWISE, STRONGEST = "Bytewise", "Strongest plain method"
+ELLIPSOIDS = "3DGS-MCMC, its weights, degree {}"
+OTHERS = {
+    STRONGEST + EQUAL_TIME: "strongest plain method, equal time",
+    STRONGEST: "strongest plain method, equal iterations",
+    ELLIPSOIDS.format(0): "3DGS-MCMC, degree 0",
+    ELLIPSOIDS.format(3): "3DGS-MCMC, degree 3",
+}
+"""Methods that `bytewise` is compared with, in the words of the tables."""
+BUDGETS = (0.3, 1.2)
+LEVEL = 0.05
+"""Level of the endpoints: one is decided if its p-value, corrected where others stand beside it, is below, and its t
+interval excludes 0."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Endpoint:
+    """A figure of a comparison of dense captures that was registered."""
+
+    budget: float
+    other: str
+    figure: str = "psnr"
+
+
+PRIMARY = Endpoint(0.3, STRONGEST + EQUAL_TIME)
+SECONDARY = (
+    Endpoint(0.3, STRONGEST),
+    Endpoint(0.3, STRONGEST + EQUAL_TIME, "lpips"),
+    Endpoint(1.2, STRONGEST + EQUAL_TIME),
+    Endpoint(0.3, ELLIPSOIDS.format(0)),
+)
+
+
+def endpoints_table(results: Sequence[Result], confirmation: Sequence[Result]) -> str:
+    """Return the table of the endpoints; p-values of the secondary ones are corrected together.
+
+    Args:
+      results: runs of dense captures.
+      confirmation: runs of captures that nothing was tuned on, each of which has a column.
+    """
+    found = {one: compare(row_of(results, one.budget, one.other).differences(one.figure)) for one in registered()}
+    finished = [one for one in SECONDARY if found[one].by_scene]
+    corrected = dict(zip(finished, holm({str(one): found[one].p_value for one in finished}).values(), strict=True))
+    captures = list(dict.fromkeys(result.run.cell.scene.label for result in confirmation))
+    lines = []
+    for one in registered():
+        if not found[one].by_scene:
+            continue
+        p_value = corrected.get(one, found[one].p_value)
+        role = "primary" if one == PRIMARY else "secondary"
+        unseen = compare(row_of(confirmation, one.budget, one.other).differences(one.figure)).by_scene
+        shown = [tables.signed(unseen.get(name, float("nan")), tables.DIGITS[one.figure]) for name in captures]
+        texts = endpoint_texts(one, found[one])
+        lines.append([role, *texts, tables.number(p_value, 3), decision(found[one], p_value), *shown])
+    return table(["", "`bytewise` −", "", "mean over captures", "won", "p", "", *captures], lines)
+
+
+def registered() -> tuple[Endpoint, ...]:
+    """Return all endpoints, the primary one first."""
+    return PRIMARY, *SECONDARY
+
+
+def endpoint_texts(one: Endpoint, found: Comparison) -> list[str]:
+    """Return the other method, the figure with its budget, the mean with its interval, and the captures won."""
+    sign = -1 if one.figure == "lpips" else 1
+    won = sum(sign * value > 0 for value in found.by_scene.values())
+    place = f"Δ{one.figure.upper()}, {one.budget:g} MB"
+    mean = found.over_scenes.as_text(tables.DIGITS[one.figure])
+    return [OTHERS[one.other], place, mean, f"{won}/{len(found.by_scene)}"]
+
+
+def decision(found: Comparison, p_value: float) -> str:
+    """Return whether an endpoint is decided."""
+    return "**decided**" if found.is_decided and p_value < LEVEL else "undecided"
+
+
+def row_of(results: Sequence[Result], budget: float, other: str, stratum: str = "") -> Row:
+    """Return the comparison of `bytewise` with a method in some of the results."""
+    place = f"{budget:g} MB" + (f", {stratum}" if stratum else "")
+    chosen = [result for result in results if result.run.cell.budget == budget]
+    return Row(f"{OTHERS[other]}, {place}", chosen, BYTEWISE, other)
+
+
+def exploration_table(rows: Sequence[Row]) -> str:
+    """Return all comparisons that have runs, none of them called decided."""
+    lines = []
+    for row in rows:
+        found = {figure: row.compared(figure) for figure in tables.QUALITY}
+        psnr = found["psnr"]
+        if not psnr.by_scene:
+            continue
+        low, high = bootstrap(row.differences("psnr"))
+        texts = [found[figure].over_scenes.as_text(digits) for figure, digits in tables.DIGITS.items()]
+        drawn = tables.MISSING if np.isnan(low) else f"{low:+.2f} to {high:+.2f}"
+        lines.append([row.name, texts[0], drawn, *texts[1:], f"{psnr.num_won}/{len(psnr.by_scene)}"])
+    return table(["`bytewise` −", "ΔPSNR, dB", "bootstrap", "ΔSSIM", "ΔLPIPS", "captures won"], lines)
+
+
+def scenes_table(results: Sequence[Result], others: Sequence[str]) -> str:
+    """Return the PSNR of `bytewise` on each capture, and what it gains over other methods."""
+    lines = []
+    for (label, budget), block in tables.grouped(
+        results, lambda result: (result.run.cell.scene.label, result.run.cell.budget)
+    ):
+        own = [result for result in block if result.label == BYTEWISE]
+        if not own:
+            continue
+        gains = []
+        for other in others:
+            found = (Row("", block, BYTEWISE, other).compared(figure).by_scene for figure in tables.QUALITY)
+            means = (next(iter(by_scene.values()), float("nan")) for by_scene in found)
+            texts = (tables.signed(mean, digits) for mean, digits in zip(means, (2, 3, 3), strict=True))
+            gains.append(" / ".join(texts))
+        lines.append([label, f"{budget:g}", str(len(own)), tables.quality(own), *gains])
+    header = ["capture", "MB", "runs", "`bytewise`: PSNR / SSIM / LPIPS", *(f"− {OTHERS[other]}" for other in others)]
+    return table(header, lines)
+
+
+def times_text(results: Sequence[Result]) -> str:
+    """Return how long the runs of equal time took beside `bytewise`."""
+    ratios = []
+    for _, block in tables.grouped(results, lambda result: result.run.cell):
+        times = {result.label: result.record.get("training_seconds") for result in block}
+        pair = times.get(STRONGEST + EQUAL_TIME), times.get(BYTEWISE)
+        if None not in pair:
+            ratios.append(pair[0] / pair[1])
+    if not ratios:
+        return ""
+    return (
+        f"The last stages of equal time took {min(ratios):.2f} to {max(ratios):.2f} times as long as those of "
+        f"`bytewise`, {np.mean(ratios):.2f} on average, in {len(ratios)} pairs.\n"
+    )
+
+
+def present(lab: Lab, grids: Sequence[Grid]) -> None:
+    """Write the tables of the finished runs."""
+    (grid,) = grids
+    results = tables.results_of(grid, lab.records)
+    confirmation = tables.results_of(read_grid("confirmation", lab.scale), lab.records)
+    dense, few, unseen = (
+        [result for result in each if (result.run.cell.scene.fold is None) == is_dense]
+        for each, is_dense in ((results, True), (results, False), (confirmation, True))
+    )
+    rows = [row_of(dense, budget, other) for budget in BUDGETS for other in OTHERS]
+    rows += [row_of(few, budget, other, "few views") for budget in BUDGETS for other in OTHERS]
+    lab.write(EXPERIMENT.name, f"# {grid.title}\n\n{endpoints_table(dense, unseen)}\n{times_text(dense)}")
+    lab.write("exploration", f"# All comparisons\n\n{exploration_table(rows)}\n{scenes_table(results, list(OTHERS))}")
+
+
+EXPERIMENT = Experiment("claims", ("claims",), present, __doc__)
