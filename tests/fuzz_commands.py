@@ -28,7 +28,7 @@ def write_runs(folder: Path) -> None:
 
     history = History.empty()
     for iteration in range(1, 6):
-        history = history.with_point(1, iteration, 0.5 / iteration, 20.0, 12, 0.1, float(iteration))
+        history = with_row(history, 1, iteration, 0.5 / iteration, 20.0, 12, 0.1, float(iteration))
     for name in SYSTEMS:
         run, system = create_run(folder / name), chosen_system(name, "smoke")
         record = RunRecord(SceneSource("synthetic"), name, system, ("gaussians-2d-mcmc",), "smoke")

@@ -172,6 +172,6 @@ def _write_run(folder: Path) -> None:
     save_model(run.own(run.model("a2tg-textures")), some_model())
     history = History.empty()
     for iteration in range(1, 6):
-        history = history.with_point(1, iteration, 0.5 / iteration, 20.0, 12, 0.1, float(iteration), l1=0.25)
+        history = with_row(history, 1, iteration, 0.5 / iteration, 20.0, 12, 0.1, float(iteration), l1=0.25)
     write_history(run.own(folder / "history" / "a.csv"), history)
     shutil.rmtree(folder / "checkpoints", ignore_errors=True)

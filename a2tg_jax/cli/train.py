@@ -290,25 +290,26 @@ def train_defaults(arguments: Sequence[str]) -> Train:
     Raises:
       ValueError, FileNotFoundError: if there is no such system, preset, file or run, or it is invalid.
     """
-    found, _ = tyro.cli(DecidingOptions, prog="a2tg train", args=arguments, return_unknown_args=True, add_help=False)
-    for path in (found.config, found.out):
+    given, _ = tyro.cli(DecidingOptions, prog="a2tg train", args=arguments, return_unknown_args=True, add_help=False)
+    for path in (given.config, given.out):
         expanded(path)  # Raises ValueError for a URL.
-    record = RunRecord(SceneSource())
-    if found.resume and found.config:
+    if given.resume and given.config:
         raise ValueError("--resume takes every option from the run folder: leave out --config")
-    if found.out and found.resume and not found.overwrite:
+    record = RunRecord(SceneSource())
+    if given.out and given.resume and not given.overwrite:
+        out = Path(given.out)
         # Several processes read the folder at once; the first one locks it later.
-        with contextlib.nullcontext(open_run(Path(found.out))) if found.coordinator else opened(Path(found.out)) as run:
-            record = read_record(run)
-            # Those that are given are added, so that the same number may be given twice.
-            record = record.with_options(more=())
-    elif found.config:
-        record = read_run_file(Path(found.config))
+        with contextlib.nullcontext(open_run(out)) if given.coordinator else opened(out) as run:
+            # Further iterations that are given are added, so that the same number may be given twice.
+            record = read_record(run).with_options(more=())
+    elif given.config:
+        record = read_run_file(Path(given.config))
     # A resumed run keeps its system and preset; `resumed` reports other ones.
-    if not found.resume and (found.preset or found.system not in ("", record.system)):
-        record = record.with_system(found.system or record.system, found.preset or None)
-    # MISSING makes SCENE required in tyro.
-    scene = record.scene if record.scene.path else dataclasses.replace(record.scene, path=tyro.MISSING)
+    if not given.resume and (given.preset or given.system not in ("", record.system)):
+        record = record.with_system(given.system or record.system, given.preset or None)
+    scene = record.scene
+    if not scene.path:  # tyro requires what is MISSING.
+        scene = dataclasses.replace(scene, path=tyro.MISSING)
     return Train(dataclasses.replace(record, scene=scene), tyro.MISSING)
 
 

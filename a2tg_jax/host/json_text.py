@@ -126,7 +126,7 @@ def _parsed(parse: Callable[[], Any]) -> Any:
         # Level by level, because a recursive walk might overflow the stack itself.
         level = [value] if isinstance(value, dict | list) else []
         for _ in range(DEEPEST):
-            deeper = []
+            deeper: list[Any] = []
             for container in level:
                 deeper += container.values() if isinstance(container, dict) else container
             level = [inner for inner in deeper if isinstance(inner, dict | list)]
