@@ -34,7 +34,8 @@ def main(folder: pathlib.Path) -> None:
 
 def emulated_python(folder: pathlib.Path) -> list[str]:
     """Unpack QEMU and Python for ARM with the libraries that it needs; return the command that starts it."""
-    root, state = folder / "root", folder / "apt"
+    root = folder / "root"
+    state = folder / "apt"
     (state / "lists/partial").mkdir(parents=True, exist_ok=True)
     (state / "archives/partial").mkdir(parents=True, exist_ok=True)
     (state / "status").touch()  # Nothing is installed yet.

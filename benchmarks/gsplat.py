@@ -22,7 +22,8 @@ timed = functools.partial(timing.timed, wait=lambda _: torch.cuda.synchronize())
 
 def main() -> None:
     case = json.loads(sys.argv[1])
-    width, height = case["width"], case["height"]
+    width = case["width"]
+    height = case["height"]
     splats = random_splats(case["num"])
     # Flat Gaussians have no third scale; gsplat wants one and does not use it.
     scales = splats.scales[:, [0, 1, 1]]

@@ -32,11 +32,13 @@ def write_scene(folder: pathlib.Path, num: int, width: int, height: int) -> None
     """Write a transforms.json, points, and JPEG files: the built-in scene, enlarged and with noise."""
     made = a2tg_jax.synthetic_scene(num_views=NUM_PICTURES, width=600, height=round(600 * height / width))
     views = sorted((*made.train, *made.test), key=lambda view: view.name)
-    images, rng = folder / "images", np.random.default_rng(0)
+    images = folder / "images"
+    rng = np.random.default_rng(0)
     images.mkdir(parents=True)
     frames = []
     for index in range(num):
-        view, path = views[index % NUM_PICTURES], images / f"{index:04d}.jpg"
+        view = views[index % NUM_PICTURES]
+        path = images / f"{index:04d}.jpg"
         if index < NUM_PICTURES:
             picture = np.asarray(Image.fromarray(view.image).resize((width, height)))
             noise = rng.integers(0, 6, picture.shape, np.uint8)
@@ -65,7 +67,8 @@ def measure(case: dict) -> dict:
     a2tg_jax.configure_cpu()
     start = time.perf_counter()
     scene = a2tg_jax.load_scene(case["scene"], downscale=case["downscale"], room=int(SHARE_OF_MEMORY * case["limit"]))
-    loaded, system = time.perf_counter(), a2tg_jax.A2tg.preset("smoke")
+    loaded = time.perf_counter()
+    system = a2tg_jax.A2tg.preset("smoke")
     found = {"photographs": len(scene.train) + len(scene.test), "size": scene.train[0].picture.size[::-1]}
     pictures = [view.picture for view in (*scene.train, *scene.test)]
     found["held"], found["photographs_bytes"] = sum(p.is_held for p in pictures), sum(p.nbytes for p in pictures)

@@ -16,7 +16,8 @@ from benchmarks.timing import timed
 
 def measure_limit(case: dict) -> dict:
     """Return the time of a number of multiply-adds and one exp per pixel and splat, and nothing else."""
-    module, width = ir.Module("limit"), llvm_code.num_lanes("float32")
+    module = ir.Module("limit")
+    width = llvm_code.num_lanes("float32")
     writer = Writer(module, "limit", ("data",), ("num",), "float32")
     at = lanes.Lanes(writer.b, width)
     reals = at.vector(writer.real)

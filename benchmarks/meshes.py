@@ -29,7 +29,8 @@ SMALL = (160, 106)
 """Width and height of the views that place the splats."""
 SIDE, LOGIT_OPACITY = 0.006, 2.0
 """Standard deviation of a splat in metres, and its opacity."""
-FACES, ATLAS = 100_000, 2048
+FACES = 100_000
+ATLAS = 2048
 
 
 def main() -> None:
@@ -71,7 +72,8 @@ def model_on_surfaces(num: int, num_views: int, width: int, height: int) -> a2tg
 def normals_at(points: np.ndarray) -> np.ndarray:
     """Return the unit normals [P, 3] of the built-in scene at points [P, 3] on its surfaces."""
     shapes = [shape for shape, _ in still_life(np.random.default_rng(0))]
-    nearest, normals = np.full(len(points), np.inf), np.zeros(points.shape)
+    nearest = np.full(len(points), np.inf)
+    normals = np.zeros(points.shape)
     for shape in shapes:
         place, normal = shape.place(*shape.locate(points.T.astype(np.float32)))
         distance = np.linalg.norm(place - points.T, axis=0)
@@ -85,8 +87,11 @@ def measure(model: a2tg.Model, resolution: int, has_texture: bool):
     assert model.origin is not None
     cameras = model.origin.cameras
     center, radius = common_sphere(model.origin.viewmats)
-    space, grid = Space.of(center, radius, radius / resolution, False), BlockGrid(GRID_BYTES)
-    renderer, depths_of, times = Renderer(model, cameras=cameras), jax.jit(rendered_depth), []
+    space = Space.of(center, radius, radius / resolution, False)
+    grid = BlockGrid(GRID_BYTES)
+    renderer = Renderer(model, cameras=cameras)
+    depths_of = jax.jit(rendered_depth)
+    times = []
     for camera in cameras:
         rendered, depths = seconds(lambda camera=camera: jax.block_until_ready(depths_of(renderer(camera), camera)))
         fused, _ = seconds(lambda depths=depths: fuse(grid, depths, space))

@@ -19,13 +19,16 @@ timed = functools.partial(timing.timed, wait=jax.block_until_ready)
 
 def measure_stages(case: dict) -> dict:
     """Measure each stage apart."""
-    num, width, height = case["num"], case["width"], case["height"]
+    num = case["num"]
+    width = case["width"]
+    height = case["height"]
     gaussians, camera = random_scene(num, width, height)
     textures = random_textures(num, case.get("textures", "none"))
     settings = a2tg_jax.RenderSettings(tile_size=case.get("tile_size", 8))
     settings = a2tg_jax.plan_render(gaussians, camera, textures, settings=settings)
     capacity = settings.capacity or 0
-    appearance, grid = appearance_of(gaussians, textures, settings), TileGrid(width, height, settings.tile_size)
+    appearance = appearance_of(gaussians, textures, settings)
+    grid = TileGrid(width, height, settings.tile_size)
     project = jax.jit(lambda gaussians: project_gaussians(gaussians, camera, appearance, settings.near_plane, 3))
     splats, cutoff = project(gaussians)
     compositing, texels, regions = settings_of_pass(
@@ -33,7 +36,8 @@ def measure_stages(case: dict) -> dict:
     )
     find_lists = jax.jit(lambda M, cutoff: list_tiles("auto", M, cutoff, settings.near_plane, grid, capacity))
     lists = find_lists(splats.M, cutoff)
-    jacobian, probe = camera.K @ camera.viewmat[:3, :3], jnp.zeros((num, 4))
+    jacobian = camera.K @ camera.viewmat[:3, :3]
+    probe = jnp.zeros((num, 4))
 
     def colors(splats, texels):
         return composite(compositing, splats, texels, regions, cutoff, lists, jacobian, probe)[0]
@@ -63,7 +67,8 @@ def measure_stages(case: dict) -> dict:
 
 def measure_step(case: dict) -> dict:
     """Measure a whole training step, between two events."""
-    kind, tile_size = case.get("textures", "none"), case.get("tile_size", 8)
+    kind = case.get("textures", "none")
+    tile_size = case.get("tile_size", 8)
     system, index = ("gaussians-2d-mcmc", 0) if kind == "none" else ("a2tg", 1)
     textures = random_textures(case["num"], kind)
     size = case["width"], case["height"]

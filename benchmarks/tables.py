@@ -26,7 +26,8 @@ STAGES = (
 
 
 def main() -> None:
-    report, documents = json.loads(pathlib.Path(sys.argv[1]).read_text()), [pathlib.Path(name) for name in sys.argv[2:]]
+    report = json.loads(pathlib.Path(sys.argv[1]).read_text())
+    documents = [pathlib.Path(name) for name in sys.argv[2:]]
     texts = [document.read_text() for document in documents]
     for name, (make, sections) in TABLES.items():
         missing = [section for section in sections if not report.get(section)]
@@ -160,7 +161,8 @@ def training(report: dict) -> str:
 def gpu(report: dict) -> str:
     cases = measured(report["gpu"])
     head = ["N", "program", "textures", "forward", "forward + backward", "training step", "memory of the step, MB"]
-    names, rows = {"render": "this library", "gsplat": "gsplat, 2D Gaussians"}, []
+    names = {"render": "this library", "gsplat": "gsplat, 2D Gaussians"}
+    rows = []
     steps = {(case["num"], case["textures"]): case for case in cases if case["case"] == "step"}
     for case in cases:
         if case["case"] in names:

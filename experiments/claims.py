@@ -12,7 +12,8 @@ from lab.markdown import table
 from lab.statistics import Comparison, bootstrap, compare, holm
 from lab.tables import EQUAL_TIME, Result
 
-BYTEWISE, STRONGEST = "Bytewise", "Strongest plain method"
+BYTEWISE = "Bytewise"
+STRONGEST = "Strongest plain method"
 ELLIPSOIDS = "3DGS-MCMC, its weights, degree {}"
 OTHERS = {
     STRONGEST + EQUAL_TIME: "strongest plain method, equal time",
@@ -22,9 +23,6 @@ OTHERS = {
 }
 """Methods that `bytewise` is compared with, in the words of the tables."""
 BUDGETS = (0.3, 1.2)
-LEVEL = 0.05
-"""Level of the endpoints: one is decided if its p-value, corrected where others stand beside it, is below, and its t
-interval excludes 0."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,8 +82,8 @@ def endpoint_texts(one: Endpoint, found: Comparison) -> list[str]:
 
 
 def decision(found: Comparison, p_value: float) -> str:
-    """Return whether an endpoint is decided."""
-    return "**decided**" if found.is_decided and p_value < LEVEL else "undecided"
+    """Return whether an endpoint is decided, given its p-value, corrected where others stand beside it."""
+    return "**decided**" if dataclasses.replace(found, p_value=p_value).is_decided else "undecided"
 
 
 def row_of(results: Sequence[Result], budget: float, other: str, stratum: str = "") -> Row:

@@ -19,8 +19,10 @@ import a2tg_jax as a2tg
 from a2tg_jax.results.folder import write_json
 from a2tg_jax.training import fit_stage
 
-TIMED_ITERATIONS, TIMED_ROUNDS = 150, 3
-SMOKE_ITERATIONS, SMOKE_ROUNDS = 20, 1
+TIMED_ITERATIONS = 150
+TIMED_ROUNDS = 3
+SMOKE_ITERATIONS = 20
+SMOKE_ROUNDS = 1
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
@@ -40,7 +42,8 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
 def table_of_times(lab: Lab, grid: Grid) -> str:
     """Return size and speed of a grid's models, measured once and kept in efficiency.json; runs without times are left
     out."""
-    path, rows = lab.out / f"{EXPERIMENT.name}.json", []
+    path = lab.out / f"{EXPERIMENT.name}.json"
+    rows = []
     kept = read_kept(path)
     for result in tables.results_of(grid, lab.records):
         key = result.run.job.key

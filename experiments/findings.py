@@ -37,9 +37,14 @@ LEAST_SCENES = 3
 """Smallest number of scenes of a row on the page: an interval of two says nothing."""
 QUICK, QUICK_SIZE = "in `quick`", 60
 """Name of E1's place in the table, and its bytes per pixel; other sizes are in NOTEBOOK.md."""
-DENSE, FEW = "dense", "few views"
-BEST, MCMC, TEXTURED = "Best plain method", "2DGS*-MCMC", "Textured Gaussians*"
-BYTEWISE, SECOND, FIRST = "Bytewise", "Bytewise, second version", "Bytewise, first version"
+DENSE = "dense"
+FEW = "few views"
+BEST = "Best plain method"
+MCMC = "2DGS*-MCMC"
+TEXTURED = "Textured Gaussians*"
+BYTEWISE = "Bytewise"
+SECOND = "Bytewise, second version"
+FIRST = "Bytewise, first version"
 VERSIONS = {BYTEWISE: "bytewise", SECOND: "bytewise 2", FIRST: "bytewise 1"}
 """Names in the table of `bytewise` and of its earlier versions: the second places no Gaussians by errors of pictures,
 and the first has textures and no weight on opacities either."""
@@ -111,7 +116,8 @@ def rows_of_bytewise(results: Sequence[Result], in_equal_time: Sequence[Result])
     """Return the comparisons of `bytewise`, by stratum and budget. At equal iterations, all runs count. At equal time,
     plain methods in `results` trained for as long as the first version, and in `in_equal_time` for as long as the
     present one."""
-    rows, order = [], list(VERSIONS)
+    rows = []
+    order = list(VERSIONS)
     for stratum in (DENSE, FEW):
         for budget in (0.3, 1.2):
             own, timed = (
@@ -183,7 +189,7 @@ def rows_at_length(grid: Grid, degree: int, records: Mapping[str, Record], place
     rows = []
     for num, results in tables.grouped(tables.results_of(grid, records), lambda result: result.run.cell.gaussians):
         at_size = f"{place}, {num:,} Gaussians" if has_sizes else place
-        is_on_page = not has_sizes or (num, degree) == SIZE_OF_ENDPOINT
+        is_on_page = (num, degree) == SIZE_OF_ENDPOINT if has_sizes else place != PLACES["long"]
         rows += rows_against(grid, degree, results, own, at_size, is_on_page)
         if degree == 3:
             zero = suffixed(MCMC, 0) + EQUAL_BYTES
@@ -278,7 +284,7 @@ def with_interval(found: Comparison, figure: str) -> str:
 
 
 def emphasized(text: str, found: Comparison) -> str:
-    """Return a text in bold if the t interval of its comparison excludes 0."""
+    """Return a text in bold if its comparison is decided."""
     return f"**{text}**" if found.is_decided else text
 
 

@@ -33,7 +33,8 @@ from a2tg_jax.host.text import did_you_mean
 
 MODULES = ("choose_plain", "findings", "claims", "ablation", "resolution_shares", "efficiency")
 """Modules of this folder that hold an EXPERIMENT; the one that measures time comes last."""
-EVERYTHING, PAGES = "all", "pages"
+EVERYTHING = "all"
+PAGES = "pages"
 OTHERS = {
     EVERYTHING: "All of these experiments, then the pages.",
     PAGES: "Write the tables of docs/results.md and NOTEBOOK.md from the committed results.",

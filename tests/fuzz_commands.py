@@ -18,7 +18,7 @@ REACHED = "all was read"
 def write_runs(folder: Path) -> None:
     """A finished run of every system, each with its record, history, metrics and models."""
     from run_folders import create_run
-    from small_models import some_model
+    from small_models import some_model, with_row
 
     from a2tg_jax import save_model
     from a2tg_jax.results.folder import write_json

@@ -14,7 +14,7 @@ from fuzz_mutate import zipped
 from fuzz_readers import PICTURES
 from PIL import Image
 from run_folders import create_run
-from small_models import some_checkpoint, some_model
+from small_models import some_checkpoint, some_model, with_row
 from test_captures import write_metashape, write_polycam_with_depth, write_realityscan, write_record3d
 from test_data_colmap import CAMERAS, write_scene as write_colmap
 from test_data_transforms import FOCAL, SIZE, write_blender, write_frames, write_json, write_ply

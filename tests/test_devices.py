@@ -34,9 +34,7 @@ def test_devices_of_a_session_are_several():
 def test_views_that_devices_cannot_share_are_refused():
     check_batch_size(1, 1)
     check_batch_size(8, 4)
-    with pytest.raises(
-        ValueError, match=r"of the 4 devices, .*; got 1: take 4 or a multiple of it, or 1 of"
-    ):
+    with pytest.raises(ValueError, match=r"of the 4 devices, .*; got 1: take 4 or a multiple of it, or 1 of"):
         check_batch_size(1, 4)
 
 

@@ -216,9 +216,9 @@ def test_the_papers_rows_have_the_runs_that_there_are():
     lines = findings.short_table(rows).splitlines()[2:]
     assert lines == [
         "| **at the paper's length, degree 0** |  |  |  |  |  |",
-        "| A²TG − plain (5 of 6 scenes) | **+1.24 ± 0.26** | **-0.012** | +0.000 | 5/5 | .062 |",
+        "| A²TG − plain (5 of 6 scenes) | +1.24 ± 0.26 | -0.012 | +0.000 | 5/5 | .062 |",
         "| A²TG − plain, first stage | **+1.25 ± 0.20** | **-0.013** | +0.000 | 6/6 | .031 |",
-        "| A²TG, improved − plain (5 of 6 scenes) | **+2.00 ± 0.00** | **-0.020** | +0.000 | 5/5 | .062 |",
+        "| A²TG, improved − plain (5 of 6 scenes) | +2.00 ± 0.00 | -0.020 | +0.000 | 5/5 | .062 |",
         "| A²TG, improved − plain, first stage | **+2.00 ± 0.00** | **-0.020** | +0.000 | 6/6 | .031 |",
     ]
 

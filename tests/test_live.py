@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import jax
 import numpy as np
+from small_models import with_row
 from test_compact import plain, textured
 
 from a2tg_jax import Gaussians2dMcmc, synthetic_scene

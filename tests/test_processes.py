@@ -13,11 +13,11 @@ from run_folders import create_run
 
 import a2tg_jax as a2tg
 from a2tg_jax.cli import main as cli
+from a2tg_jax.cli.processes import LOST, is_lost
 from a2tg_jax.cli.train import train_defaults
 from a2tg_jax.host.machine import Devices
 from a2tg_jax.io.archive import write_archive
 from a2tg_jax.io.model_file import load_model
-from a2tg_jax.parallel import LOST, is_lost
 from a2tg_jax.results import run_processes
 from a2tg_jax.results.commands import resuming_command
 from a2tg_jax.results.folder import RunFolder
@@ -77,18 +77,18 @@ def test_a_process_that_does_not_come_is_reported():
     """And before, that there is no cluster."""
     code = f"""
 import sys
-from a2tg_jax import parallel
+from a2tg_jax.cli import processes
 try:
-    parallel.joined(parallel.ProcessPlace("auto", None, None, 60.0), str).__enter__()
+    processes.joined(processes.ProcessPlace("auto", None, None, 60.0), str).__enter__()
 except ValueError as error:
     print(error, file=sys.stderr)
-parallel.JOIN_SECONDS = 1
-parallel.joined(parallel.ProcessPlace("127.0.0.1:{free_port()}", 2, 0, 60.0), str).__enter__()
+processes.JOIN_SECONDS = 1
+processes.joined(processes.ProcessPlace("127.0.0.1:{free_port()}", 2, 0, 60.0), str).__enter__()
 """
     alone = started(["-c", code])
     printed = alone.communicate(timeout=120)[1]
     assert "--coordinator auto: no Slurm, Open MPI or Kubernetes was found: give HOST:PORT" in printed
-    assert alone.returncode != 0 and "DEADLINE_EXCEEDED" in printed
+    assert alone.returncode == -signal.SIGABRT and "DEADLINE_EXCEEDED" in printed
 
 
 def test_the_command_to_go_on_names_devices_and_processes(tmp_path):

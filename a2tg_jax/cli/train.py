@@ -18,6 +18,7 @@ from tyro.constructors import StructConstructorSpec, StructFieldSpec, StructType
 
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.cli.arguments import LpipsWeights
+from a2tg_jax.cli.processes import AUTO, ProcessPlace, joined
 from a2tg_jax.core.budget import budget_in_bytes
 from a2tg_jax.data.load import SceneSource
 from a2tg_jax.data.scene import Scene
@@ -27,7 +28,6 @@ from a2tg_jax.host.regular_files import expanded
 from a2tg_jax.host.text import counted, defaulting_to
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.mcmc import Mcmc
-from a2tg_jax.parallel import AUTO, ProcessPlace, joined
 from a2tg_jax.results.commands import file_command, resuming_command
 from a2tg_jax.results.folder import RunFolder, open_run, opened
 from a2tg_jax.results.forecast import room_for_photographs

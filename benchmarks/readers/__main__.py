@@ -111,14 +111,16 @@ def main() -> None:
     for suffix in WRITTEN_BY_SPLAT_TRANSFORM:
         file = out / f"theirs{suffix}"
         transform(out / "scene.ply", file, chosen.others)
-        found, theirs = load_splats(file).gaussians, by_splat_transform(file, chosen.others)
+        found = load_splats(file).gaussians
+        theirs = by_splat_transform(file, chosen.others)
         print(f"{suffix} by splat-transform, against the model: {differences(found, wanted)}")
         print(f"{suffix} by splat-transform, against its own reader: {differences(found, theirs)}", flush=True)
     if chosen.chromium is None or model.origin is None:
         return
     (ours,) = pictures(model, [model.origin.cameras[chosen.camera]])
     save_splats(out / "scene.glb", model)
-    original, standing = model.origin.transform.inverse(), upright(model.origin, "y")
+    original = model.origin.transform.inverse()
+    standing = upright(model.origin, "y")
     drawn = [("playcanvas", BY_PLAYCANVAS, original), ("spark", SUFFIXES, original), ("babylon", (".glb",), standing)]
     for page, suffixes, world in drawn:
         camera = camera_in(world, model.origin, chosen.camera)

@@ -45,7 +45,8 @@ def draw(page: str, file: Path, camera: Camera, others: Path, chromium: str) -> 
       others: folder with the node_modules of the programs.
       chromium: command of Chromium.
     """
-    drawn, is_drawn = list[bytes](), threading.Event()
+    drawn = list[bytes]()
+    is_drawn = threading.Event()
 
     class Handler(http.server.BaseHTTPRequestHandler):
         def log_message(self, *arguments: Any) -> None:

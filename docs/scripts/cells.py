@@ -12,7 +12,8 @@ import a2tg_jax as a2tg
 from a2tg_jax.results.figures import level_maps, level_picture
 from a2tg_jax.results.images import save_picture, side_by_side, to_uint8
 
-BUDGET, DEGREE = "0.1MB", 3
+BUDGET = "0.1MB"
+DEGREE = 3
 PART = slice(20, 132), slice(24, 136)
 """Rows and columns of the view that are shown."""
 

@@ -22,7 +22,11 @@ from a2tg_jax.core.gaussians import floats_per_gaussian
 from a2tg_jax.rasterize.pixel import absorb
 from a2tg_jax.texture import BYTES_PER_TEXEL
 
-BLUE, ORANGE, GREEN, GREY, PURPLE = "#3b6fb6", "#e07b39", "#4f9d5d", "#8a8a8a", "#8c6bb1"
+BLUE = "#3b6fb6"
+ORANGE = "#e07b39"
+GREEN = "#4f9d5d"
+GREY = "#8a8a8a"
+PURPLE = "#8c6bb1"
 EXTENT = a2tg.TextureOptions().extent
 
 
@@ -101,7 +105,8 @@ def draw_ray() -> plt.Figure:
     side.set(xlim=(-0.6, 10), ylim=(-1.75, 2.1), aspect="equal")
     side.axis("off")
 
-    left, weights = 1.0, []
+    left = 1.0
+    weights = []
     for alpha in alphas:
         weight, left, _ = absorb(jnp.asarray(alpha), jnp.asarray(left), jnp.asarray(True))
         weights.append(float(weight))

@@ -15,14 +15,17 @@ from a2tg_jax.results.images import save_animation, to_uint8
 
 FROM, TO = -55.0, 85.0
 """Ends of the arc in degrees; 0 is the view of the most central camera."""
-NUM_FRAMES, FRAMES_PER_SECOND, QUALITY = 37, 12, 72
+NUM_FRAMES = 37
+FRAMES_PER_SECOND = 12
+QUALITY = 72
 
 
 def main(model: pathlib.Path, out: pathlib.Path, num_frames: int = NUM_FRAMES) -> None:
     """Render the frames and write them."""
     found = a2tg.load_model(model)
     assert found.origin is not None
-    draw, ring = a2tg.Renderer(found), turntable(found.origin.cameras, 360)
+    draw = a2tg.Renderer(found)
+    ring = turntable(found.origin.cameras, 360)
     # Slow at both ends, where it turns.
     shares = (1 - np.cos(np.pi * np.arange(num_frames) / (num_frames - 1))) / 2
     degrees = np.rint(FROM + (TO - FROM) * shares).astype(int)

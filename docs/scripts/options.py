@@ -46,7 +46,8 @@ class Option(NamedTuple):
 
 def help_of(*words: str) -> str:
     """Return the help of a command as the program prints it in one column."""
-    told, before = io.TextIOWrapper(io.BytesIO(), encoding="utf-8"), os.environ.get("COLUMNS")
+    told = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")
+    before = os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = WIDTH
     try:
         with contextlib.redirect_stdout(told):
@@ -103,7 +104,8 @@ def _cell(text: str) -> str:
 
 def page() -> str:
     """Return the whole page."""
-    parts, of_train = [OPENING], {system: options_of("train", "--system", system) for system in SYSTEMS}
+    parts = [OPENING]
+    of_train = {system: options_of("train", "--system", system) for system in SYSTEMS}
     own = own_options(of_train)
     for name in command_line.COMMANDS:
         options = options_of(name)

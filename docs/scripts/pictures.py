@@ -31,7 +31,9 @@ MODELS = pathlib.Path("runs/pictures")
 ITERATIONS = 2_000
 BUDGET = "0.3MB"
 NORMALS = {"normal_weight": 0.2}
-NUM_FACES, ATLAS, RESOLUTION = 100_000, 1024, 256
+NUM_FACES = 100_000
+ATLAS = 1024
+RESOLUTION = 256
 WINDOW = 1100, 660
 WIDTH, GAP, QUALITY = 560, 8, 88
 """Pixels of a mesh's view and between two, and the quality of JPEG files."""
@@ -170,10 +172,12 @@ def screenshot(browser: "DevTools", address: str, window: tuple[int, int]) -> by
     browser("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
     browser("Page.navigate", url=address)
     browser("Runtime.evaluate", expression=LOADED, awaitPromise=True)
-    before, now = b"", b"-"
+    before = b""
+    now = b"-"
     while before != now:  # The page draws finer and finer pictures.
         browser("Runtime.evaluate", expression="new Promise(done => setTimeout(done, 3000))", awaitPromise=True)
-        before, now = now, b64decode(browser("Page.captureScreenshot", format="png")["data"])
+        before = now
+        now = b64decode(browser("Page.captureScreenshot", format="png")["data"])
     return now
 
 
@@ -181,7 +185,9 @@ class DevTools:
     """Chromium's DevTools protocol: JSON messages that end in a zero byte."""
 
     def __init__(self, commands: IO[bytes], answers: IO[bytes]):
-        self._commands, self._answers, self._num = commands, answers, 0
+        self._commands = commands
+        self._answers = answers
+        self._num = 0
         self.session: str | None = None
 
     def __call__(self, method: str, **parameters: Any) -> dict[str, Any]:

@@ -223,7 +223,9 @@ class Lab:
         return self.args.memory_gb * 1e9 if self.args.memory_gb is not None else MEMORY_SHARE * memory_limit()
 
     def _pool(self) -> Pool:
-        args, inf, memory = self.args, float("inf"), self._memory()
+        args = self.args
+        inf = float("inf")
+        memory = self._memory()
         if args.cluster:
             parameters = {**CLUSTER_DEFAULTS.get(args.cluster, {}), **dict(map(_parameter, args.cluster_parameter))}
             is_here = args.cluster == "local"

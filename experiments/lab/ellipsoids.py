@@ -42,7 +42,8 @@ class Ellipsoids(a2tg.Appearance):
             raise ValueError("ellipsoids are drawn by cameras without distortion only; undistort the photographs")
         _, normals = super().homographies(gaussians, camera)
         axes = rotation_matrices(gaussians.quats) * self.scales(gaussians)[:, None, :]
-        to_camera, K = camera.viewmat[:3, :3], camera.K
+        to_camera = camera.viewmat[:3, :3]
+        K = camera.K
         in_camera = jnp.sum(to_camera[None, :, :, None] * axes[:, None, :, :], axis=2)  # [N, 3, 3]: columns are axes
         x, y, z = (jnp.sum(gaussians.means * to_camera[i][None], axis=1) + camera.viewmat[i, 3] for i in range(3))
         z = jnp.where(z > 1e-6, z, jnp.asarray(1e-6, z.dtype))

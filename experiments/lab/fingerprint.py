@@ -20,7 +20,8 @@ def is_same_so_far(made: a2tg.System, wanted: a2tg.System, index: int) -> bool:
     """Return whether two systems train their stages up to `index` alike, whatever follows."""
     if common_options(made) != common_options(wanted):
         return False
-    stages, others = made.stages(), wanted.stages()
+    stages = made.stages()
+    others = wanted.stages()
     return all(is_equal(stages[at], others[at]) for at in range(index + 1))
 
 

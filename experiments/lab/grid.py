@@ -156,7 +156,8 @@ class Grid:
         return self._job(method, dataclasses.replace(cell, budget=None, gaussians=splats_in(mb, method)))
 
     def _job(self, method: Method, cell: Cell) -> Job:
-        scene, place = cell.scene, f"{self.name}{SUFFIX}: {method.label!r}"
+        scene = cell.scene
+        place = f"{self.name}{SUFFIX}: {method.label!r}"
         if method.choices is not None:
             method = method.choices[scene.label]
         if method.by_number and cell.budget is not None:
@@ -227,7 +228,8 @@ def read_grid(
       ValueError: if the file lacks the scale or has a mistake, or a scene or a method is unknown.
     """
     path = grid_path(name)
-    file, place = read_grid_file(path), path.name
+    file = read_grid_file(path)
+    place = path.name
     own_table = file.scale(scale, place)
     settings, known_scenes = _settings(own_table, scale, path)
     methods = _methods(file, place)
@@ -294,9 +296,11 @@ def _methods(file: GridFile, place: str) -> dict[str, Method]:
 
 
 def _method(label: str, table: MethodTable, base: Method | None, place: str) -> Method:
-    system, options = table.system, table.options
+    system = table.system
+    options = table.options
     if base is not None:
-        system, options = system or base.system, merged(base.options, options)
+        system = system or base.system
+        options = merged(base.options, options)
     if system is None:
         raise ValueError(f"{place}: method {label!r} has neither a system nor a method that it is like")
     return Method(label, system, options, table.floats, table.most, table.by_number)

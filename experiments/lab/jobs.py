@@ -121,7 +121,8 @@ def num_gaussians(system: a2tg.System) -> int:
 @functools.lru_cache(maxsize=10_000)
 def model_bytes(system: a2tg.System) -> float:
     """Return the bytes of the largest model of a system's stages; only shapes are computed, no device is used."""
-    num, bases = num_gaussians(system), NUM_BASES[system.initial_sh_degree]
+    num = num_gaussians(system)
+    bases = NUM_BASES[system.initial_sh_degree]
     largest = 0.0
     for stage in system.stages():
         # Bands begin empty, and their places cannot be traced.
@@ -190,7 +191,8 @@ def run_job(job: Job, folders: Folders, stop_at: float = math.inf) -> Record | N
       The record, or None if training was stopped.
     """
     scene = folders.load_scene(job)
-    path, model = folders.record(job), folders.model(job)
+    path = folders.record(job)
+    model = folders.model(job)
     if path.is_file() and model.is_file() and not is_from_before(read_json(path)):
         times: tuple[str, ...] = ("fps",)
         record = {**read_json(path), **_quality(scene, a2tg.load_model(model), folders)}
@@ -215,7 +217,8 @@ def run_job(job: Job, folders: Folders, stop_at: float = math.inf) -> Record | N
 def _train(job: Job, folders: Folders, scene: a2tg.Scene, stop_at: float) -> tuple[a2tg.StageResult, float | None]:
     """Return the result of the stage, and its time without compilation; None for that if a program that did not keep
     it had begun."""
-    path, time_path = _ready(folders.checkpoint(job)), folders.time_so_far(job)
+    path = _ready(folders.checkpoint(job))
+    time_path = folders.time_so_far(job)
     start = None if job.start is None else a2tg.load_model(folders.model(job.start))
     checkpoint = _load_checkpoint(path, job) if path.is_file() else None
     earlier = 0.0
@@ -258,7 +261,8 @@ def _load_checkpoint(path: Path, job: Job) -> a2tg.Checkpoint:
 
 def _training_facts(job: Job, scene: a2tg.Scene, result: a2tg.StageResult) -> Record:
     """Return what was trained and what it took."""
-    first, changed = scene.test[0].camera, own_options(job.system, type(job.system)())
+    first = scene.test[0].camera
+    changed = own_options(job.system, type(job.system)())
     return {
         "scene": job.scene, "downscale": job.downscale, "pixels": [first.width, first.height],
         "system": reference_of(job.system), "version": job.system.version, "options": changed,

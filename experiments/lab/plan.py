@@ -24,12 +24,10 @@ COMPILE_SECONDS, OTHER_SECONDS = 5.0, 4.0
 """Seconds on one core to compile a program of training, and to load, measure and save a stage."""
 MOST_ROWS = 40
 """Largest number of cells in the table."""
-FINISHED, GPU, MISSING, CPU = (
-    "the steps of finished stages of the same size",
-    "the paper's program on its GPU, since none has been timed here",
-    "the paper's program on its GPU, since not all scenes are below --scenes",
-    "a very rough figure of CPUs, which may be wrong by a factor of two",
-)
+FINISHED = "the steps of finished stages of the same size"
+GPU = "the paper's program on its GPU, since none has been timed here"
+MISSING = "the paper's program on its GPU, since not all scenes are below --scenes"
+CPU = "a very rough figure of CPUs, which may be wrong by a factor of two"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,7 +64,8 @@ def plan_of(grids: Sequence[Grid], records: Mapping[str, Record], folders: Folde
     left = [stage for key, stage in stages.items() if key not in records]
     if not left:
         return f"{_cells(grids, records)}\nAll {len(stages)} stages are finished."
-    steps, forecaster = sum(stage.job.iterations for stage in left), Forecaster(folders)
+    steps = sum(stage.job.iterations for stage in left)
+    forecaster = Forecaster(folders)
     estimates = [_estimate(stage.job, records, machine, forecaster) for stage in left]
     return (
         f"{_cells(grids, records)}\n"

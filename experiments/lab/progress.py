@@ -15,7 +15,9 @@ class Progress:
     """Lines about the stages of some grids."""
 
     def __init__(self, grids: Sequence[Grid], records: Mapping[str, Record], log: Path):
-        self._grids, self._records, self._log = grids, records, log
+        self._grids = grids
+        self._records = records
+        self._log = log
         self._stages = stages_of(grids, records)
         self._total = sum(key not in records for key in self._stages)
         self._numbers: dict[str, int] = {}

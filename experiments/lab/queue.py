@@ -91,7 +91,9 @@ class LocalPool:
     """
 
     def __init__(self, slots: int, memory: float, num_gpus: int = 0, limit: TimeLimit = TimeLimit()):
-        self.slots, self.memory, self.limit = slots, memory, limit
+        self.slots = slots
+        self.memory = memory
+        self.limit = limit
         self._num_gpus = num_gpus
         self._cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
         self._executor = self._new_executor()

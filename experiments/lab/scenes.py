@@ -44,7 +44,9 @@ class SceneAt:
         return self.label.rpartition("/")[0]
 
 
-NUM_FOLDS, FEW_VIEWS, MOST_SCORED = 5, 21, 12
+NUM_FOLDS = 5
+FEW_VIEWS = 21
+MOST_SCORED = 12
 
 
 def few_views(scene: a2tg.Scene, fold: int) -> a2tg.Scene:

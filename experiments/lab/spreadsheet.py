@@ -24,7 +24,8 @@ def rows_text(results: Iterable[tuple[str, Result]]) -> str:
 
 
 def _row(grid: str, result: Result) -> list[object]:
-    cell, job = result.run.cell, result.run.job
+    cell = result.run.cell
+    job = result.run.job
     place = [cell.scene.label, result.label, cell.size.replace(",", ""), result.record["num"], cell.budget, cell.seed]
     figures = [_rounded(result.record.get(name), digits) for name, digits in DIGITS.items()]
     return [grid, *place, sum(job.all_iterations), *figures, job.key]

@@ -17,7 +17,8 @@ class Stage:
     run: Run
 
     def __str__(self) -> str:
-        cell, stage = self.run.cell, self.job.system.stages()[self.job.stage].name
+        cell = self.run.cell
+        stage = self.job.system.stages()[self.job.stage].name
         size = cell.size if cell.budget is not None else f"{cell.size} Gaussians"
         if self.run.equal:
             size = f"{self.run.equal} of {size}"

@@ -14,6 +14,8 @@ from lab.jobs import Record
 from lab.tables import CONFIDENCE, QUALITY, Result, SceneMean, grouped, over_scenes
 
 NUM_DRAWS = 10_000
+LEVEL = 1 - CONFIDENCE
+"""Level of p-values."""
 Differences = Mapping[str, Sequence[np.ndarray]]
 """Differences of the views of every pair [V], by scene."""
 
@@ -30,8 +32,8 @@ class Comparison:
 
     @property
     def is_decided(self) -> bool:
-        """Whether the t interval excludes 0."""
-        return abs(self.over_scenes.mean) > self.over_scenes.half_width
+        """Whether the t interval excludes 0, and the p-value is below the level."""
+        return abs(self.over_scenes.mean) > self.over_scenes.half_width and self.p_value < LEVEL
 
     @property
     def num_won(self) -> int:
@@ -53,7 +55,8 @@ def differences(results: Sequence[Result], label: str, other: str, figure: str) 
         views = {result.label: _by_view(result.record) for result in block if result.label in (label, other)}
         if len(views) < 2:
             continue
-        own, base = views[label], views[other]
+        own = views[label]
+        base = views[other]
         if own.keys() != base.keys():
             raise ValueError(f"{label} and {other} were scored on different views of {cell.scene.label}")
         pair = [np.array([figures[name][place] for name in own], float) for figures in (own, base)]  # None is NaN.
@@ -104,7 +107,8 @@ def _scene_means(pairs: Sequence[np.ndarray], num: int, rng: np.random.Generator
 
 def holm(p_values: Mapping[str, float]) -> dict[str, float]:
     """Return p-values corrected for their number by Holm's step-down procedure."""
-    corrected, highest = {}, 0.0
+    corrected = {}
+    highest = 0.0
     for index, (name, p_value) in enumerate(sorted(p_values.items(), key=lambda item: item[1])):
         highest = max(highest, min(1.0, (len(p_values) - index) * p_value))
         corrected[name] = highest

@@ -87,6 +87,7 @@ def union(intervals: Iterable[tuple[float, float]]) -> list[tuple[float, float]]
     for start, end in sorted(intervals):
         if joined and start <= joined[-1][1]:
             first, last = joined.pop()
-            start, end = first, max(last, end)
+            start = first
+            end = max(last, end)
         joined.append((start, end))
     return joined
