@@ -132,7 +132,7 @@ def compress(
     default = opened.path.with_suffix(SUFFIX)
     out = default if out is None else out
     check_output(out)
-    check_export(out, default, "--out", overwrite=overwrite)
+    check_export(out, default, "`out`", overwrite=overwrite)
     # Before the photographs are loaded, and minutes of trials.
     check_encodable(model.appearance)
     ladder = TUNED_LADDER if num_iterations else LADDER

@@ -20,12 +20,18 @@ import numpy as np
 from a2tg_jax.data.scene import Scene, views_by_kind
 from a2tg_jax.host import signals
 from a2tg_jax.io.model_file import load_model
-from a2tg_jax.parallel import any_process, broadcast
+from a2tg_jax.parallel import any_process, broadcast, check_batch_size, leave
 from a2tg_jax.results.record import RunRecord
 from a2tg_jax.training import DivergedError, Session, fit_stage, load_checkpoint
 
 COMPARED = ("options", "`devices`", "views, cameras or points")
 """Facts that processes compare with the first one's."""
+
+
+def check_batch_sizes(record: RunRecord, session: Session) -> None:
+    """Raise ValueError if the devices of all processes cannot share the views of a step evenly."""
+    for system in record.systems.values():
+        check_batch_size(system.batch_size, session.num_devices)
 
 
 def check_alike(record: RunRecord, scene: Scene, session: Session) -> None:
@@ -68,6 +74,11 @@ def send_stage(name: str | None, files: Sequence[Path | None] = (), num_restored
         broadcast(json.dumps({"name": name, "num_restored": num_restored}).encode())
         for file in files:
             broadcast(b"" if file is None else file.read_bytes())
+
+
+def leave_others() -> None:
+    """End the common work after the last stage; the first process measures alone."""
+    leave()
 
 
 def follow_first_process(record: RunRecord, scene: Scene, session: Session) -> None:

@@ -16,7 +16,6 @@ from a2tg_jax.host.machine import Devices
 from a2tg_jax.io.formats import load_splats
 from a2tg_jax.io.model_file import load_model, number_in_file, save_model
 from a2tg_jax.model import Model
-from a2tg_jax.parallel import check_batch_size, leave
 from a2tg_jax.results.commands import file_command, resuming_command
 from a2tg_jax.results.compression import SUFFIX, CompressOptions, compress
 from a2tg_jax.results.folder import RunFolder, check_free, claimed, iteration_of, put_back_old, set_aside
@@ -29,7 +28,7 @@ from a2tg_jax.results.record import OnNan, RunRecord, is_finished, read_record, 
 from a2tg_jax.results.report import RunResult
 from a2tg_jax.results.run_checkpoints import check_finished, last_state, newest_checkpoint
 from a2tg_jax.results.run_evaluation import check_held_out, check_weights, evaluate_run
-from a2tg_jax.results.run_processes import check_alike, send_stage
+from a2tg_jax.results.run_processes import check_alike, check_batch_sizes, leave_others, send_stage
 from a2tg_jax.training import Checkpoint, DivergedError, Session, StageResult, fit_stage, save_checkpoint
 from a2tg_jax.training.loop import IsStopped, Watch, never, unwatched
 from a2tg_jax.training.recorded_views import check_names
@@ -87,7 +86,7 @@ def begin_run(record: RunRecord, out: Path, options: RunOptions) -> RunResult:
     """
     # Cheap checks come before the scene is loaded.
     record.check()
-    _check_batch_sizes(record, options)
+    check_batch_sizes(record, options.session)
     check_weights(options.lpips_weights)
     if not record.scene.is_built_in:
         check_apart(out, Path(record.scene.path))
@@ -121,7 +120,7 @@ def resume_run(run: RunFolder, options: RunOptions) -> RunResult:
     """Train the stages of a claimed run that are not finished yet, and measure. Raises as `begin_run`."""
     check_weights(options.lpips_weights)
     record = read_record(run)
-    _check_batch_sizes(record, options)
+    check_batch_sizes(record, options.session)
     if is_finished(run, record):
         print(f"{run.path} is finished; to train it on: {resuming_command(run)} --more 2000", flush=True)
     scene = record.scene.load(room_for_photographs(options.max_memory))
@@ -130,11 +129,6 @@ def resume_run(run: RunFolder, options: RunOptions) -> RunResult:
     num_given = _num_given(run, record)
     print_forecast(scene, record, options.max_memory, options.session.num_devices, num_given)
     return _train_and_measure(run, record, scene, options)
-
-
-def _check_batch_sizes(record: RunRecord, options: RunOptions) -> None:
-    for system in record.systems.values():
-        check_batch_size(system.batch_size, options.session.num_devices)
 
 
 def _num_given(run: RunFolder, record: RunRecord) -> int | None:
@@ -149,7 +143,7 @@ def _train_and_measure(run: RunFolder, record: RunRecord, scene: Scene, options:
         check_alike(record, scene, options.session)
         with signals.noted() as is_stopped, options.watched(scene) as watch:
             train_run(run, scene, options, is_stopped=is_stopped, watch=watch)
-        leave()
+        leave_others()
         result = evaluate_run(run, scene, lpips_weights=options.lpips_weights)
         if record.file_bytes is not None:
             _write_file(run, record, record.file_bytes, scene, progress=options.progress)
