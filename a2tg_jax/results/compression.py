@@ -165,14 +165,23 @@ def compress(
         RunFolder(source).own(out)
     write_whole(out, data)
     lines = _table(trials, tuned, chosen, losses) if verbose else []
+    return "\n".join([*lines, *_notes(tuned, max_bytes), _result(out, model, chosen)])
+
+
+def _notes(tuned: TunedFiles, max_bytes: int | None) -> list[str]:
+    """Return lines about a tuning that did not lead to the file."""
+    lines = []
     if tuned.diverged:
         lines.append(f"tuning ended early, what was found before is kept: {tuned.diverged}")
     if max_bytes is not None and tuned.tried and tuned.chosen is None:
         best = f"the best of {len(tuned.tried)} has {in_bytes(min(trial.num_bytes for trial in tuned.tried))}"
         lines.append(f"no tuned file is small enough, {best}: the untuned one is kept")
+    return lines
+
+
+def _result(out: Path, model: Model, chosen: Trial) -> str:
     share = f"1/{model.num_bytes / chosen.num_bytes:.1f} of the model's numbers"
-    lines.append(f"{out}: {in_bytes(chosen.num_bytes)} on disk, {share}, {loss_text(chosen.losses[0])}")
-    return "\n".join(lines)
+    return f"{out}: {in_bytes(chosen.num_bytes)} on disk, {share}, {loss_text(chosen.losses[0])}"
 
 
 def _search(

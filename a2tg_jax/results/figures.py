@@ -176,7 +176,9 @@ def sizes_figure(sizes: np.ndarray) -> Figure:
     """Plot the number of Gaussians by the resolution of their textures, sizes [N, 2], as a map of Tv × Tu."""
     # Textures grow by doubling their sides.
     sides = 2 ** np.arange(int(np.log2(max(4, sizes.max()))) + 1)
-    counts = np.array([[np.sum((sizes == (tv, tu)).all(axis=1)) for tu in sides] for tv in sides])
+    counts = np.zeros((len(sides), len(sides)), int)
+    for row, column in np.ndindex(*counts.shape):
+        counts[row, column] = np.sum((sizes == (sides[row], sides[column])).all(axis=1))
     figure = Figure(figsize=(1.2 + 0.95 * len(sides), 0.9 + 0.75 * len(sides)), layout="constrained")
     axes = figure.add_subplot()
     shown = np.log10(1.0 + counts)  # Most Gaussians have the smallest size; others would be invisible.

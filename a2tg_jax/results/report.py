@@ -164,7 +164,10 @@ def summary_table(result: RunResult, names: Sequence[str]) -> tuple[list[str], l
     """Return titles and rows of the summary table: a column for each model, a row for each metric present."""
     models = [result.models[name] for name in names]
     rows = []
-    for split in dict.fromkeys(split for model in models for split in model.splits):
+    splits: dict[str, Evaluation] = {}
+    for model in models:
+        splits |= model.splits
+    for split in splits:
         views, _, way = split.partition("_")
         title = f"{views}, {WAYS[way]}:" if way else views
         for quality, metric, digits in QUALITIES:
@@ -393,7 +396,11 @@ def write_report(
 
 def _marked(rows: Sequence[Sequence[str]]) -> set[tuple[int, int]]:
     """Return the (row, column) of the cells with a metric's best value."""
-    return {(index, column) for index, row in enumerate(rows) for column in _best(row)}
+    marked = set()
+    for index, row in enumerate(rows):
+        for column in _best(row):
+            marked.add((index, column))
+    return marked
 
 
 def _best(row: Sequence[str]) -> list[int]:
