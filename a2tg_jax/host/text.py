@@ -1,6 +1,5 @@
 """Short texts for messages."""
 
-import dataclasses
 import difflib
 import shlex
 from collections.abc import Iterable, Sequence
@@ -72,20 +71,3 @@ def _three_digits(number: float) -> str:
     if number < 99.95:
         return f"{number:.1f}"
     return f"{number:,.0f}"
-
-
-def name_replace(cls: Any) -> None:
-    """Let the error of an assignment to a field of a frozen dataclass say how to make a changed copy."""
-    refuse = cls.__setattr__
-
-    def __setattr__(self: Any, name: str, value: object) -> None:
-        try:
-            refuse(self, name, value)
-        except dataclasses.FrozenInstanceError:
-            names = [field.name for field in dataclasses.fields(self)]
-            hint = f"make a changed copy: dataclasses.replace(old, {name}=...)"
-            if name not in names:
-                hint = f"it has no field {name}, only {', '.join(names)}"
-            raise dataclasses.FrozenInstanceError(f"{type(self).__name__} cannot be changed; {hint}") from None
-
-    cls.__setattr__ = __setattr__
