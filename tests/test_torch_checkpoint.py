@@ -134,9 +134,6 @@ def test_pytorch_opens_what_is_written(tmp_path):
 def test_checkpoints_are_refused_with_what_to_write_instead(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     save_splats(path, Model(some_gaussians()))
-    with pytest.raises(
-        ValueError, match=rf"a\{suffix}: is a checkpoint, .* not read; write a PLY: gsplat does with --save_ply"
-    ):
+    wanted = rf"a\{suffix}: a checkpoint can be written, but not read; write a PLY: gsplat does with --save_ply"
+    with pytest.raises(ValueError, match=wanted):
         load_splats(path)
-    with pytest.raises(FileNotFoundError, match=rf"b\{suffix}: no such checkpoint"):
-        load_splats(tmp_path / f"b{suffix}")

@@ -71,7 +71,7 @@ def parse(
 
     Raises:
       SystemExit: after help (code 0) or an error (code 2), which tyro has printed.
-      ValueError: if a URL is given where only paths on this machine work.
+      ValueError: if a path is a URL.
     """
     if {"-h", "--help"} & set(arguments):  # It takes a second.
         _fill_help(default or kind)

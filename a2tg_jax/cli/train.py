@@ -96,7 +96,7 @@ class Demo:
 class Train:
     """Train a scene, evaluate the model and write a report.
 
-      SCENE                  scene folder with photographs and cameras, its URL, or built in: "synthetic", "cells"
+      SCENE                  scene folder with photographs and cameras, or built in: "synthetic", "cells"
       --out RUN              run folder for models, checkpoints, metrics, pictures and report.html
       --system NAME          method: bytewise (default; the best picture for its bytes), a2tg (the paper's), ...
       --preset NAME          paper (default), quick (minutes on two cores) or smoke (half a minute)

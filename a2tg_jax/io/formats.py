@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from a2tg_jax.core.origin import BLACK
-from a2tg_jax.data.other_runs import model_hint
+from a2tg_jax.data.other_runs import HOW_TO_EXPORT, model_hint
 from a2tg_jax.host.regular_files import expanded, is_regular
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.io.compact import load_compact, save_compact
@@ -18,7 +18,7 @@ from a2tg_jax.io.ply import encode_packed_ply, load_ply_model, save_ply
 from a2tg_jax.io.sog import HEADER, STREAMED_HEADER, encode_sog, load_sog, sog_files
 from a2tg_jax.io.splat_files import decode_ksplat, decode_splat, encode_ksplat, encode_splat
 from a2tg_jax.io.spz import decode_spz, encode_spz
-from a2tg_jax.io.torch_checkpoint import refuse_checkpoint, save_checkpoint_gaussians
+from a2tg_jax.io.torch_checkpoint import save_checkpoint_gaussians
 from a2tg_jax.io.usd import import_usd, load_usd, save_usd
 from a2tg_jax.model import Model
 
@@ -37,7 +37,7 @@ class FileFormat:
     """Format of files, and what it keeps of a model besides its Gaussians."""
 
     name: str
-    load: Callable[[Path], Model]
+    load: Callable[[Path], Model] | None
     save: Writer | None
     keeps_appearance: bool = False
     """Whether textures, and everything else that splats show, are kept."""
@@ -60,7 +60,7 @@ _GLTF = FileFormat(
     "glTF", load_gltf, save_gltf, keeps_appearance=True, keeps_origin=True, is_exact=False, has_extension=True
 )
 _USD = FileFormat("OpenUSD", load_usd, save_usd, keeps_origin=True, is_exact=False, import_library=import_usd)
-_CHECKPOINT = FileFormat("checkpoint", refuse_checkpoint, save_checkpoint_gaussians)
+_CHECKPOINT = FileFormat("checkpoint", None, save_checkpoint_gaussians)
 FORMATS = {
     ".npz": FileFormat(
         "model", load_model, save_model, keeps_appearance=True, keeps_origin=True, keeps_corrections=True
@@ -136,7 +136,10 @@ def load_splats(path: str | os.PathLike[str]) -> Model:
       ValueError: if the suffix is unknown, an optional library is missing, or the file is damaged.
     """
     path = splats_at(expanded(path))
-    return format_of(path).load(path)
+    format = format_of(path)
+    if format.load is None:
+        raise ValueError(f"{path}: a {format.name} can be written, but not read; {HOW_TO_EXPORT}")
+    return format.load(path)
 
 
 def save_splats(path: str | os.PathLike[str], model: Model, *, world: World = "original") -> None:

@@ -19,10 +19,10 @@ from a2tg_jax.core.checks import check_int, check_literal
 from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.host.regular_files import expanded
-from a2tg_jax.host.text import PROGRAM, shortened
+from a2tg_jax.host.text import shortened
 from a2tg_jax.io.columns import Ends, dequantised, ends_of, quantised
 from a2tg_jax.io.config_json import config_from_dict
-from a2tg_jax.io.gltf_container import Builder, Document, mesh_nodes
+from a2tg_jax.io.gltf_container import Builder, Document, mesh_nodes, scene_of_one
 from a2tg_jax.io.model_file import appearance_from_dict, appearance_to_dict, background_of, origin_of
 from a2tg_jax.io.model_rows import Rows, check_encodable, model_of, rows_of_model
 from a2tg_jax.io.other_programs import (
@@ -32,12 +32,14 @@ from a2tg_jax.io.other_programs import (
     joined_parts,
     linear_colors,
     matrix_of,
+    model_of_splats,
     origin_to_json,
     splats_of,
+    to_bytes,
     upright,
 )
 from a2tg_jax.io.spz import GLTF_AXES, decode_spz
-from a2tg_jax.io.validate import check_model, check_suffix, live_model, numbers_of, reading
+from a2tg_jax.io.validate import check_suffix, live_model, numbers_of, reading
 from a2tg_jax.model import Model
 from a2tg_jax.texture import MAX_SIDE
 
@@ -124,7 +126,7 @@ def save_gltf(
     }
     # Linear RGB and opacity as bytes, for programs that show points.
     shown = linear_colors(np.clip(splats.sh[:, 0] * SH_C0 + 0.5, 0.0, 1.0))
-    points = np.rint(255 * np.concatenate([shown, splats.opacities[:, None]], axis=1)).astype(np.uint8)
+    points = to_bytes(255 * np.concatenate([shown, splats.opacities[:, None]], axis=1))
     attributes["COLOR_0"] = builder.add(points, normalized=True)
     # The extension stores one attribute for each coefficient, not one array.
     for degree in range(NUM_BASES.index(splats.sh.shape[1]) + 1):
@@ -146,15 +148,8 @@ def save_gltf(
     node = {"name": "splats", "mesh": 0, "matrix": matrix.T.ravel().tolist()}
     # Mode 0: points, which programs without the extension show.
     primitive = {"attributes": attributes, "mode": 0, "extensions": {SPLATS: described}, "extras": {OWN: kept}}
-    whole = {
-        "asset": {"version": "2.0", "generator": PROGRAM},
-        "extensionsUsed": [SPLATS, *described.get("extensions", {})],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [node],
-        "meshes": [{"primitives": [primitive]}],
-    }
-    builder.save(expanded(path), whole)
+    used = [SPLATS, *described.get("extensions", {})]
+    builder.save(expanded(path), {"extensionsUsed": used, **scene_of_one(node, primitive)})
 
 
 def _extension_of(builder: Builder, model: Model, kind: TexelKind) -> dict[str, Any]:
@@ -247,11 +242,9 @@ def _model_of(document: Document, primitive: Mapping[str, Any]) -> Model:
         shown, rows, base_degree = _shown(document, extended, splats)
         appearance = _kept_appearance(kept, shown, is_described=True)
         return model_of(rows, base_degree, appearance, origin, background_of(kept))
-    gaussians = gaussians_of(splats, document.path, is_flat=False)
     appearance = _kept_appearance(kept, Appearance(), is_described=False)
-    model = Model(gaussians, appearance, background=background_of(kept), origin=origin)
-    check_model(model)
-    return model
+    background = background_of(kept)
+    return model_of_splats(splats, document.path, appearance=appearance, background=background, origin=origin)
 
 
 def _splats(document: Document, attributes: Mapping[str, object]) -> Ellipsoids:

@@ -22,7 +22,7 @@ from a2tg_jax.data.ply import turn_of
 from a2tg_jax.host.atomic import replacing, write_whole
 from a2tg_jax.host.json_text import parse_json
 from a2tg_jax.host.regular_files import LARGEST_RATIO, MOST_ARRAY_BYTES, is_regular, read_regular, room_of
-from a2tg_jax.host.text import shortened
+from a2tg_jax.host.text import PROGRAM, shortened
 from a2tg_jax.io.validate import existing_bytes, numbers_of
 
 MAGIC = b"glTF"
@@ -94,13 +94,20 @@ class Builder:
     def save(self, path: Path, described: Mapping[str, object]) -> None:
         """Write the file, *.gltf with a *.bin, any other name as one *.glb.
 
-        Existing files are replaced once the new ones are complete. `described` is the JSON minus accessors and buffers.
+        Existing files are replaced once the new ones are complete. `described` is the JSON minus asset, accessors and
+        buffers.
 
         Raises:
           ValueError: if a *.glb cannot hold this many bytes.
         """
         buffer: dict[str, Any] = {"byteLength": self._num_bytes}
-        whole = {**described, "accessors": self.accessors, "bufferViews": self._views, "buffers": [buffer]}
+        whole = {
+            "asset": {"version": "2.0", "generator": PROGRAM},
+            **described,
+            "accessors": self.accessors,
+            "bufferViews": self._views,
+            "buffers": [buffer],
+        }
         if path.suffix.lower() == ".gltf":
             binary = path.with_suffix(".bin")
             buffer["uri"] = urllib.parse.quote(binary.name)
@@ -120,6 +127,16 @@ class Builder:
         with replacing(path) as temporary, open(temporary, "wb") as file:
             file.write(start + text + CHUNK.pack(self._num_bytes, BINARY_CHUNK))
             file.writelines(self._pieces)
+
+
+def scene_of_one(node: Mapping[str, object], primitive: Mapping[str, object]) -> dict[str, Any]:
+    """Return the JSON of a scene of one node, whose mesh 0 has one primitive."""
+    return {
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [node],
+        "meshes": [{"primitives": [primitive]}],
+    }
 
 
 # Reading

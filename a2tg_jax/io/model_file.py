@@ -151,10 +151,10 @@ def appearance_to_dict(appearance: Appearance) -> dict[str, Any]:
 def appearance_from_dict(data: Mapping[str, Any], appearances: Sequence[type[Appearance]] = ()) -> Appearance:
     """Return the template that `appearance_to_dict` or version 0.2 described. ValueError: its class is unknown."""
     name = data["name"]
+    options = data["options"]
     module = data["module"]
     is_built_in = module.partition(".")[0] == __name__.partition(".")[0]
     if is_built_in and "parts" not in data:
-        options = data["options"]
         if name in OLD_PARTS:
             return dataclasses.replace(appearance_from_dict(data["held"]["inner"], appearances), **OLD_PARTS[name])
         if name == "Textured":

@@ -30,7 +30,7 @@ from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity, check_similarity, transform_gaussians
 from a2tg_jax.host.atomic import write_whole
 from a2tg_jax.host.text import counted, first_names, shortened
-from a2tg_jax.io.columns import morton
+from a2tg_jax.io.columns import logits_of, morton, opacities_of
 from a2tg_jax.io.model_file import origin_arrays, origin_header
 from a2tg_jax.io.validate import LARGEST_LOG_SCALE, check_model, check_origin, existing_bytes, reading
 from a2tg_jax.model import Model, concatenate
@@ -52,7 +52,7 @@ LEVEL = math.cos(math.radians(3))
 LEAST_SCALE = 1e-30
 LEAST_OPACITY = 1e-6
 FILTER = "filter_3D"
-"""Name of the widths of Mip-Splatting's filter, in PLY files and checkpoints."""
+"""Name of the widths of Mip-Splatting's filter in PLY files."""
 LEAST_LENGTH = 1e-9
 """Length of a quaternion below which, and above whose inverse, it is made a unit quaternion."""
 LEAST_THIRD_SCALE = math.exp(-20)
@@ -203,12 +203,12 @@ def splats_of(model: Model, *, keeps_shapes: bool = False) -> Ellipsoids:
     # Other programs expect unit quaternions; here any length is allowed.
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     units = np.where(norms > 0, quats / np.maximum(norms, LEAST_SCALE), [1.0, 0.0, 0.0, 0.0])
-    logits = np.clip(np.asarray(gaussians.logit_opacities, np.float64), -80, 80)
+    opacities = opacities_of(np.asarray(gaussians.logit_opacities))
     log_scales = np.asarray(gaussians.log_scales, np.float64)
     scales = np.exp(np.concatenate([log_scales, third_log_scales(log_scales)], axis=1))
     # Coefficients above every splat's degree are zeros.
     sh = gaussians.sh[:, : NUM_BASES[model.degrees.max(initial=0)]]
-    return Ellipsoids.of(gaussians.means, units, scales, 1 / (1 + np.exp(-logits)), sh)
+    return Ellipsoids.of(gaussians.means, units, scales, opacities, sh)
 
 
 def third_log_scales(log_scales: np.ndarray) -> np.ndarray:
@@ -270,6 +270,11 @@ def reader_of(decode: Callable[[bytes, Path], Model]) -> Callable[[Path], Model]
     return load
 
 
+def to_bytes(values: np.ndarray) -> np.ndarray:
+    """Return numbers rounded to bytes; those beyond 0..255 are clipped."""
+    return np.rint(np.clip(values, 0, 255)).astype(np.uint8)
+
+
 def pack_bits(columns: Iterable[np.ndarray], bits: tuple[int, ...]) -> np.ndarray:
     """Return columns of unsigned integers of these bits packed into one of 32 bits, the first highest."""
     packed: Any = np.uint32(0)
@@ -327,17 +332,15 @@ def gaussians_of(
     log_scales = np.log(np.maximum(np.abs(splats.scales), LEAST_SCALE))
     if is_flat:
         log_scales = log_scales[:, :2]
-    opacities = np.clip(splats.opacities.astype(np.float64), LEAST_OPACITY, LARGEST_OPACITY)
-    logits = np.log(opacities) - np.log1p(-opacities)
+    logits = logits_of(np.clip(splats.opacities.astype(np.float64), LEAST_OPACITY, LARGEST_OPACITY))
     rows = FileRows(splats.means, splats.quats, log_scales, logits, splats.sh)
     return flat_rows(os.fspath(path), rows, keeps_all=keeps_all).gaussians
 
 
-def model_of_splats(
-    splats: Ellipsoids, path: str | os.PathLike[str], *, is_flat: bool = False, origin: Origin | None = None
-) -> Model:
-    """Return the model of a file's splats, as `gaussians_of`. ValueError: none of them can be drawn."""
-    model = Model(gaussians_of(splats, path, is_flat=is_flat), origin=origin)
+def model_of_splats(splats: Ellipsoids, path: str | os.PathLike[str], *, is_flat: bool = False, **fields: Any) -> Model:
+    """Return the model of a file's splats, as `gaussians_of`, with further fields of the model. ValueError: none of the
+    splats can be drawn."""
+    model = Model(gaussians_of(splats, path, is_flat=is_flat), **fields)
     check_model(model)
     return model
 

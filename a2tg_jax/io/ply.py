@@ -16,12 +16,12 @@ rotation as the index of its largest number and the three others in 10 bits; col
 
 import os
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-from numpy.lib.recfunctions import append_fields
+from numpy.typing import DTypeLike
 from scipy.spatial.transform import Rotation
 
 from a2tg_jax.core.gaussians import SH_C0, Gaussians, rotation_matrices
@@ -227,23 +227,19 @@ def load_ply_model(path: str | os.PathLike[str]) -> Model:
         return decode_ply(file, path)
 
 
-def decode_ply(file: BinaryIO, path: Path, *, is_flat: bool = False) -> Model:
-    """Read Gaussians from an open PLY file, as `load_ply_model` does; messages name the path.
-
-    Splats are flat if `is_flat` or the header says so.
-    """
+def decode_ply(file: BinaryIO, path: Path) -> Model:
+    """Read Gaussians from an open PLY file, as `load_ply_model` does; messages name the path."""
     ply = PlyFile(file, path)
     # A packed file begins with its chunks.
-    vertices = unpacked_vertices(ply) if [*ply.counts][:1] == ["chunk"] else _vertices(ply)
-    is_flat |= any(" ".join(words).lower() == FLAT_MARK.lower() for words in ply.comments)
-    names = vertices.dtype.names or ()
-    log_scales = _columns(vertices, SCALES if is_flat or THIRD_SCALE not in names else (*SCALES, THIRD_SCALE))
-    logits = _columns(vertices, ("opacity",))[:, 0]
-    if FILTER in names:
-        log_scales, logits = filtered(log_scales, logits, vertices[FILTER])
+    columns = unpacked_vertices(ply) if [*ply.counts][:1] == ["chunk"] else _vertices(ply)
+    is_flat = any(" ".join(words).lower() == FLAT_MARK.lower() for words in ply.comments)
+    log_scales = _stacked(columns, SCALES if is_flat or THIRD_SCALE not in columns else (*SCALES, THIRD_SCALE))
+    logits = _stacked(columns, ("opacity",))[:, 0]
+    if FILTER in columns:
+        log_scales, logits = filtered(log_scales, logits, columns[FILTER])
     # float64 until the offset is subtracted: float32 would round map coordinates.
-    means = np.stack([vertices[name].astype(np.float64) for name in MEANS], axis=-1)
-    rows = FileRows(means, _columns(vertices, QUATS), log_scales, logits, _sh_of(vertices, path))
+    means = _stacked(columns, MEANS, np.float64)
+    rows = FileRows(means, _stacked(columns, QUATS), log_scales, logits, _sh_of(columns, path))
     rows = flat_rows(str(path), rows)
     inside = offset_for("ply", rows.means, rows.log_scales)  # Zeros where the file has float32.
     gaussians = rows._replace(means=rows.means - inside).gaussians
@@ -252,8 +248,8 @@ def decode_ply(file: BinaryIO, path: Path, *, is_flat: bool = False) -> Model:
         return Model(gaussians, origin=origin_at(inside + ply.offset, ply.turn))
 
 
-def _vertices(ply: PlyFile) -> np.ndarray:
-    """Return the vertices, structured, with 2DGS's attributes."""
+def _vertices(ply: PlyFile) -> dict[str, np.ndarray]:
+    """Return the attributes of the vertices by name, among them all of 2DGS."""
     fields = ply.fields.get("vertex", {})
     # Some programs write colours instead of f_dc_*.
     has_colors = set(RGB) <= set(fields) and not set(SH_DEGREE0) & set(fields)
@@ -261,36 +257,36 @@ def _vertices(ply: PlyFile) -> np.ndarray:
     of_networks = "; its networks make splats of these anchors: export them" if ANCHORS in fields else ""
     ply.require_vertices(wanted, f"a PLY of Gaussians{of_networks}")
     vertices = ply.read("vertex")
+    columns = {name: vertices[name] for name in fields}
     warn_of_unread({*fields} - {*wanted, THIRD_SCALE, FILTER, *UNSEEN}, ply.path)
-    if not has_colors:
-        return vertices
-    colors = np.stack([vertices[name].astype(np.float64) for name in RGB], axis=1)
-    if len(colors):
-        colors /= largest_color(np.nan_to_num(colors), is_float=fields[RGB[0]].startswith("f"))
-    return append_fields(vertices, SH_DEGREE0, ((colors - 0.5) / SH_C0).T, usemask=False)
+    if has_colors:
+        colors = _stacked(columns, RGB, np.float64)
+        if len(colors):
+            colors /= largest_color(np.nan_to_num(colors), is_float=fields[RGB[0]].startswith("f"))
+        columns |= zip(SH_DEGREE0, ((colors - 0.5) / SH_C0).T, strict=True)
+    return columns
 
 
-def _sh_of(vertices: np.ndarray, path: Path) -> np.ndarray:
-    """Return the spherical harmonics [N, K, 3] of a structured array of vertices."""
-    names = {name for name in vertices.dtype.names or () if name.startswith("f_rest_")}
+def _sh_of(columns: Mapping[str, np.ndarray], path: Path) -> np.ndarray:
+    """Return the spherical harmonics [N, K, 3] of vertices with these attributes."""
+    names = {name for name in columns if name.startswith("f_rest_")}
     rest = [f"f_rest_{i}" for i in range(len(names))]
     # Gaps in the numbering would shift the channels.
     if len(rest) not in NUM_REST or names != set(rest):
         raise ValueError(f"{path}: has {len(rest)} attributes f_rest_*; SH of degree 0 to 4 have 0, 9, 24, 45 or 72")
     num_bases = NUM_BASES[degree_to_read(NUM_REST.index(len(rest)), str(path))]
-    sh = np.zeros((len(vertices), num_bases, 3), np.float32)
-    sh[:, 0] = _columns(vertices, SH_DEGREE0)
-    if rest:
-        # Channel by channel: the degree to read is cut from each channel.
-        per_channel = _columns(vertices, rest).reshape(len(vertices), 3, len(rest) // 3)
-        sh[:, 1:] = per_channel[:, :, : num_bases - 1].transpose(0, 2, 1)
-    return sh
+    constant = _stacked(columns, SH_DEGREE0)
+    if not rest:
+        return constant[:, None]
+    # Channel by channel: the degree to read is cut from each channel.
+    per_channel = _stacked(columns, rest).reshape(len(constant), 3, len(rest) // 3)
+    return np.concatenate([constant[:, None], per_channel[:, :, : num_bases - 1].transpose(0, 2, 1)], axis=1)
 
 
-def _columns(vertices: np.ndarray, wanted: Iterable[str]) -> np.ndarray:
-    """Return attributes of vertices as columns, float32."""
+def _stacked(columns: Mapping[str, np.ndarray], names: Iterable[str], dtype: DTypeLike = np.float32) -> np.ndarray:
+    """Return attributes of vertices as the columns of an array."""
     with np.errstate(over="ignore"):  # What is too large becomes infinite, which fails the checks.
-        return np.stack([vertices[name].astype(np.float32) for name in wanted], axis=-1)
+        return np.stack([columns[name].astype(dtype) for name in names], axis=-1)
 
 
 # Files that SuperSplat packed
@@ -300,23 +296,24 @@ AXES = "xyz"
 CHANNELS = "rgb"
 BOUNDS = tuple(f"{end}_{axis}" for end in ("min", "max", "min_scale", "max_scale") for axis in AXES)
 COLOR_BOUNDS = tuple(f"{end}_{channel}" for end in ("min", "max") for channel in CHANNELS)
-THREE_BITS = (11, 10, 11)
-QUAT_BITS = (2, 10, 10, 10)
-COLOR_BITS = (8, 8, 8, 8)
-PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+PACKED = {
+    "packed_position": (11, 10, 11), "packed_rotation": (2, 10, 10, 10), "packed_scale": (11, 10, 11),
+    "packed_color": (8, 8, 8, 8),
+}  # fmt: skip
+"""Attributes of a packed vertex, with the bits of the numbers in each."""
 SH_RANGE = 8.0
 """Range of the coefficients that a byte encodes."""
 
 
-def unpacked_vertices(ply: PlyFile) -> np.ndarray:
-    """Return the vertices of a packed PLY, structured, with the attribute names of 3DGS; float32."""
+def unpacked_vertices(ply: PlyFile) -> dict[str, np.ndarray]:
+    """Return the attributes of the vertices of a packed PLY, by their names in 3DGS; float32."""
     path = ply.path
     names = list(ply.counts)
     if names not in (["chunk", "vertex"], ["chunk", "vertex", "sh"]):
         raise ValueError(f"{path}: a packed PLY has the elements chunk, vertex and sh; this one has {names}")
     if ply.encoding != "binary_little_endian":
         raise ValueError(f"{path}: is a packed PLY in {ply.encoding}; binary_little_endian is expected")
-    for name, wanted in {"chunk": BOUNDS, "vertex": PACKED, "sh": ()}.items():
+    for name, wanted in {"chunk": BOUNDS, "vertex": (*PACKED,), "sh": ()}.items():
         ply.require(name, wanted, "a PLY as SuperSplat packs it")
     num = ply.counts["vertex"]
     types = [ply.fields["vertex"][name] for name in PACKED]
@@ -329,6 +326,7 @@ def unpacked_vertices(ply: PlyFile) -> np.ndarray:
     chunks, vertices, *rest = (ply.read(name) for name in names)
     # The last chunk may be partially filled.
     chunks = np.repeat(chunks, CHUNK)[:num]
+    positions, rotations, scales, colors = (_shares(vertices[name], bits) for name, bits in PACKED.items())
 
     def within(what: str, axes: str, shares: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Return columns scaled between their bounds."""
@@ -337,19 +335,17 @@ def unpacked_vertices(ply: PlyFile) -> np.ndarray:
             scaled.append(chunks[f"min_{what}{axis}"] * (1 - share) + chunks[f"max_{what}{axis}"] * share)
         return scaled
 
-    columns = dict(zip(AXES, within("", AXES, _shares(vertices["packed_position"], THREE_BITS)), strict=True))
-    scales = within("scale_", AXES, _shares(vertices["packed_scale"], THREE_BITS))
-    columns |= {f"scale_{k}": scale for k, scale in enumerate(scales)}
-    # The index of the largest number of a rotation, which follows from the others. These are within ±1/√2.
-    largest = vertices["packed_rotation"] >> np.uint32(30)
-    _, *smaller = _shares(vertices["packed_rotation"], QUAT_BITS)
-    quats = with_largest((np.stack(smaller, axis=1) - 0.5) * np.sqrt(2), largest)
-    columns |= {name: quats[:, k] for k, name in enumerate(QUATS)}
-    *colors, opacity = _shares(vertices["packed_color"], COLOR_BITS)
+    columns = dict(zip(AXES, within("", AXES, positions), strict=True))
+    columns |= zip((*SCALES, THIRD_SCALE), within("scale_", AXES, scales), strict=True)
+    # Two bits are the index of a rotation's largest number, which follows from the others. These are within ±1/√2.
+    largest, *smaller = rotations
+    quats = with_largest((np.stack(smaller, axis=1) - 0.5) * np.sqrt(2), np.rint(3 * largest).astype(np.int64))
+    columns |= zip(QUATS, quats.T, strict=True)
+    *colors, opacity = colors
     # Older files have colours in [0, 1] without bounds.
     if set(COLOR_BOUNDS) <= set(ply.fields["chunk"]):
         colors = within("", CHANNELS, colors)
-    columns |= {f"f_dc_{k}": (color - 0.5) / SH_C0 for k, color in enumerate(colors)}
+    columns |= {name: (color - 0.5) / SH_C0 for name, color in zip(SH_DEGREE0, colors, strict=True)}
     # Bytes 0 and 255 have no finite logit.
     opacity = np.clip(opacity, LEAST_OPACITY, 1 - LEAST_OPACITY)
     columns["opacity"] = logits_of(opacity)
@@ -358,10 +354,7 @@ def unpacked_vertices(ply: PlyFile) -> np.ndarray:
         # Centres of 256 bins, except at the ends, as SuperSplat decodes them.
         shares = np.where(codes == 0, 0.0, np.where(codes == 255, 1.0, (codes + 0.5) / 256))
         columns[name] = (shares - 0.5) * SH_RANGE
-    unpacked = np.empty(num, [(name, "<f4") for name in columns])
-    for name, values in columns.items():
-        unpacked[name] = values
-    return unpacked
+    return {name: values.astype(np.float32) for name, values in columns.items()}
 
 
 def _shares(packed: np.ndarray, bits: tuple[int, ...]) -> list[np.ndarray]:
@@ -394,23 +387,20 @@ def encode_packed_ply(placed: PlacedSplats) -> bytes:
         shares.append((values - low[chunks]) / np.where(width > 0, width, 1.0))
     positions, scales, shares_of_colors = shares
     largest, smaller = without_largest(splats.quats)
-    # In the order of PACKED. The largest number of a rotation is an index of two bits, from 0 to 3.
-    vertices = [
-        _packed(positions, THREE_BITS),
-        _packed(np.concatenate([largest[:, None] / 3, smaller / np.sqrt(2) + 0.5], axis=1), QUAT_BITS),
-        _packed(scales, THREE_BITS),
-        _packed(np.concatenate([shares_of_colors, splats.opacities[:, None]], axis=1), COLOR_BITS),
-    ]
+    # The largest number of a rotation is an index from 0 to 3.
+    rotations = np.concatenate([largest[:, None] / 3, smaller / np.sqrt(2) + 0.5], axis=1)
+    shares_of_colors = np.concatenate([shares_of_colors, splats.opacities[:, None]], axis=1)
+    columns = zip((positions, rotations, scales, shares_of_colors), PACKED.values(), strict=True)
+    vertices = np.stack([_packed(column, bits) for column, bits in columns], axis=1)
     # Channel by channel; a byte is one of 256 bins.
     rest = splats.sh[:, 1:].transpose(0, 2, 1).reshape(num, -1)
     codes = np.floor(np.clip((rest / SH_RANGE + 0.5) * 256, 0, 255)).astype(np.uint8)
-    names = {"chunk": (*BOUNDS, *COLOR_BOUNDS), "vertex": PACKED, "sh": SH_REST[: rest.shape[1]]}
+    names = {"chunk": (*BOUNDS, *COLOR_BOUNDS), "vertex": (*PACKED,), "sh": SH_REST[: rest.shape[1]]}
     counts = {"chunk": len(starts), "vertex": num, "sh": num}
     kinds = {"chunk": "float", "vertex": "uint", "sh": "uchar"}
     elements = []
     for element, attributes in names.items():
         if attributes:
             elements.append((element, counts[element], [(kinds[element], name) for name in attributes]))
-    columns = (np.concatenate(bounds, axis=1).astype("<f4"), np.stack(vertices, axis=1).astype("<u4"), codes)
     header = _header(place_comments(placed.offset, placed.turn), elements)
-    return header + b"".join(column.tobytes() for column in columns)
+    return header + np.concatenate(bounds, axis=1).astype("<f4").tobytes() + vertices.tobytes() + codes.tobytes()

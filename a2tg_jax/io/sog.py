@@ -30,7 +30,7 @@ from a2tg_jax.data.ply import OFFSET, ROTATION, turn_of
 from a2tg_jax.host.json_text import parse_json
 from a2tg_jax.host.regular_files import read_regular, room_of
 from a2tg_jax.host.text import PROGRAM, shortened
-from a2tg_jax.io.columns import LONGEST_WEBP_SIDE
+from a2tg_jax.io.columns import LONGEST_WEBP_SIDE, opacities_of
 from a2tg_jax.io.gltf_container import LONGEST_NAME
 from a2tg_jax.io.other_programs import (
     Ellipsoids,
@@ -212,7 +212,7 @@ def _splats(files: _Files) -> Ellipsoids:
     scales = np.exp(_decoded(header, "scales", scale_codes[:, :3], is_first=is_first))
     if is_first:  # The fourth column is the logit of the opacity.
         colors = _decoded(header, "sh0", color_codes, is_first=True)
-        opacities = 1 / (1 + np.exp(-colors[:, 3]))
+        opacities = opacities_of(colors[:, 3])
     else:
         colors = _decoded(header, "sh0", color_codes[:, :3], is_first=False)
         opacities = color_codes[:, 3] / 255

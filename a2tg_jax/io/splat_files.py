@@ -20,7 +20,7 @@ import numpy as np
 
 from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.core.sh import NUM_BASES
-from a2tg_jax.io.other_programs import LEAST_SCALE, Ellipsoids, PlacedSplats, model_of_splats
+from a2tg_jax.io.other_programs import LEAST_SCALE, Ellipsoids, PlacedSplats, model_of_splats, to_bytes
 from a2tg_jax.model import Model
 
 # .splat
@@ -35,7 +35,7 @@ def encode_splat(placed: PlacedSplats) -> bytes:
     rows["means"] = splats.means
     rows["scales"] = splats.scales
     rows["colors"] = _color_bytes(splats)
-    rows["quats"] = np.rint(np.clip(128 * splats.quats + 128, 0, 255))
+    rows["quats"] = to_bytes(128 * splats.quats + 128)
     return rows.tobytes()
 
 
@@ -56,7 +56,7 @@ def decode_splat(data: bytes, path: Path) -> Model:
 def _color_bytes(splats: Ellipsoids) -> np.ndarray:
     """Return colours of degree 0 and opacities [N, 4] as bytes."""
     colors = np.concatenate([0.5 + SH_C0 * splats.sh[:, 0], splats.opacities[:, None]], axis=1)
-    return np.rint(255 * np.clip(colors, 0, 1)).astype(np.uint8)
+    return to_bytes(255 * colors)
 
 
 def _shown_by(colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -35,6 +35,7 @@ from a2tg_jax.io.other_programs import (
     degree_to_read,
     model_of_splats,
     pack_bits,
+    to_bytes,
     unpack_bits,
     with_largest,
     without_largest,
@@ -114,9 +115,7 @@ def _means(rows: np.ndarray, head: "_Head") -> np.ndarray:
 
 def _quats(rows: np.ndarray, head: "_Head") -> np.ndarray:
     if head.version < 3:
-        xyz = rows / 127.5 - 1
-        w = np.sqrt(np.maximum(1 - np.sum(xyz**2, axis=1, keepdims=True), 0.0))
-        return np.concatenate([w, xyz], axis=1)
+        return with_largest(rows / 127.5 - 1, np.zeros(head.num, np.int64))  # w is the number that follows.
     largest, *fields = unpack_bits(rows.view("<u4")[:, 0], ROTATION_BITS)
     signs = np.stack(fields[::2], axis=1)
     magnitudes = np.stack(fields[1::2], axis=1)
@@ -273,15 +272,11 @@ def encode_spz(placed: PlacedSplats) -> bytes:
     steps = np.where(np.arange(rest.shape[1]) < 3, *SH_STEPS)[:, None]
     columns = (
         fixed.view(np.uint8).reshape(num, 3, 4)[..., :3],
-        _to_bytes(255 * splats.opacities),
-        _to_bytes(255 * (COLOR_SCALE * splats.sh[:, 0] + 0.5)),
-        _to_bytes(16 * (np.log(splats.scales) + 10)),
+        to_bytes(255 * splats.opacities),
+        to_bytes(255 * (COLOR_SCALE * splats.sh[:, 0] + 0.5)),
+        to_bytes(16 * (np.log(splats.scales) + 10)),
         rotations,
-        _to_bytes((rest + steps // 2) // steps * steps),
+        to_bytes((rest + steps // 2) // steps * steps),
     )
     head = HEAD.pack(MAGIC, WRITTEN_VERSION, num, degree, FRACTIONAL_BITS, 0, 0)
     return gzip.compress(head + b"".join(column.tobytes() for column in columns), mtime=0)
-
-
-def _to_bytes(values: np.ndarray) -> np.ndarray:
-    return np.rint(np.clip(values, 0, 255)).astype(np.uint8)

@@ -11,17 +11,14 @@ import os
 import pickle
 import zipfile
 from collections.abc import Mapping
-from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.sh import NUM_BASES
-from a2tg_jax.data.other_runs import HOW_TO_EXPORT
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.io.other_programs import World, third_log_scales, warn_of_offset, world_gaussians
-from a2tg_jax.io.validate import check_exists, check_model
+from a2tg_jax.io.validate import check_model
 from a2tg_jax.model import Model
 
 PROTOCOL = 2
@@ -31,9 +28,6 @@ SPLATFACTO = {
     "shN": "features_rest",
 }  # fmt: skip
 """Names of parameters in gsplat, in the order of its files, and in Nerfstudio's splatfacto."""
-
-
-# Writing
 
 
 def to_gsplat(model: Gaussians | Model, *, world: World = "original") -> dict[str, np.ndarray]:
@@ -121,12 +115,3 @@ def _opcodes(value: object, storages: list[np.ndarray]) -> bytes:
     arguments += [_opcodes(part, []) for part in (0, value.shape, strides, False)]
     rebuild = pickle.GLOBAL + b"torch._utils\n_rebuild_tensor_v2\n"
     return rebuild + pickle.MARK + b"".join(arguments) + hooks + pickle.TUPLE + pickle.REDUCE
-
-
-# Reading
-
-
-def refuse_checkpoint(path: Path) -> NoReturn:
-    """Raise ValueError that says how to get a PLY file instead of a checkpoint; FileNotFoundError: there is no file."""
-    check_exists(path, "checkpoint")
-    raise ValueError(f"{path}: is a checkpoint, which is written but not read; {HOW_TO_EXPORT}")

@@ -29,14 +29,14 @@ from a2tg_jax.io.model_file import background_of, origin_of
 from a2tg_jax.io.other_programs import (
     Ellipsoids,
     degree_to_read,
-    gaussians_of,
     joined_parts,
     matrix_of,
+    model_of_splats,
     origin_to_json,
     splats_of,
     upright,
 )
-from a2tg_jax.io.validate import check_exists, check_model, check_suffix, live_model, reading
+from a2tg_jax.io.validate import check_exists, check_suffix, live_model, reading
 from a2tg_jax.model import Model
 
 ORIGIN = "a2tg:origin"
@@ -211,10 +211,8 @@ def _model_of(field: Mapping[str, Any], arrays: Mapping[str, np.ndarray], prefix
     scales = column("scales", (1.0, 1.0, 1.0))
     opacities = column("opacities", (1.0,))[:, 0]
     splats = Ellipsoids(means, quats, scales, opacities, sh)
-    gaussians = gaussians_of(splats, path, is_flat=SURFLET in kernels)
     kept = {"background": BLACK} if field["origin"] is None else parse_json(field["origin"])
     # A model without an origin has a background alone.
     origin = None if set(kept) == {"background"} else origin_of(kept, kept)
-    model = Model(gaussians, background=background_of(kept), origin=origin)
-    check_model(model)
-    return model
+    is_flat = SURFLET in kernels
+    return model_of_splats(splats, path, is_flat=is_flat, background=background_of(kept), origin=origin)

@@ -12,9 +12,8 @@ from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.host.atomic import replacing, write_whole
 from a2tg_jax.host.regular_files import expanded
-from a2tg_jax.host.text import PROGRAM
 from a2tg_jax.io.gltf import OWN
-from a2tg_jax.io.gltf_container import Builder
+from a2tg_jax.io.gltf_container import Builder, scene_of_one
 from a2tg_jax.io.other_programs import linear_colors, matrix_of, upright
 from a2tg_jax.mesh.triangles import Mesh
 
@@ -167,15 +166,8 @@ def _save_glb(path: Path, mesh: Mesh, origin: Similarity | Origin | None) -> Non
         attributes["COLOR_0"] = builder.add(rows.astype(np.uint16), normalized=True)
     indices = builder.add(mesh.faces.astype(np.uint32).reshape(-1), is_attribute=False)
     unlit = {"pbrMetallicRoughness": surface, "extensions": {"KHR_materials_unlit": {}}, "doubleSided": True}
-    described: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": PROGRAM},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [node],
-        "meshes": [{"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}],
-        "materials": [unlit],
-        "extensionsUsed": ["KHR_materials_unlit"],
-    }
+    described = scene_of_one(node, {"attributes": attributes, "indices": indices, "material": 0})
+    described |= {"materials": [unlit], "extensionsUsed": ["KHR_materials_unlit"]}
     if mesh.texture is not None:
         file = io.BytesIO()
         Image.fromarray(mesh.texture).save(file, "JPEG", quality=JPEG_QUALITY, subsampling=0)

@@ -32,7 +32,8 @@ from a2tg_jax.training import History, System
 from a2tg_jax.training.stage import BACKGROUNDS
 from a2tg_jax.training.start import left_out, new_appearance, with_degree
 
-SHOWN = f"a run folder, or a file *{', *'.join(FORMATS)}"
+READABLE = [suffix for suffix, format in FORMATS.items() if format.load is not None]
+SHOWN = f"a run folder, or a file *{', *'.join(READABLE)}"
 
 
 @dataclasses.dataclass(frozen=True)
