@@ -40,7 +40,6 @@ AS_STORED = {
 LENS_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model, ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
 GPANO = re.compile(rb"""GPano:(\w+)(?:\s*=\s*["']|>)\s*([\w.]+)""")
 """Name and value in the XMP of a panorama."""
-SIDES = (b"Width", b"Height")
 LONGEST_REASON = 200
 LARGEST_LEVEL = {"L": 255, "I;16": 65535, "I": 65535}
 """Largest level of grey, by Pillow's mode."""
@@ -120,12 +119,15 @@ def picture_facts(path: str | os.PathLike[str]) -> PictureFacts:
 def _is_panorama(image: Image.Image) -> bool | None:
     # https://developers.google.com/streetview/spherical-metadata: attributes or elements of RDF.
     xmp = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b""
-    found = dict(GPANO.findall(xmp.encode() if isinstance(xmp, str) else xmp))
-    if b"ProjectionType" not in found:
+    tags = dict(GPANO.findall(xmp.encode() if isinstance(xmp, str) else xmp))
+    if b"ProjectionType" not in tags:
         return None
-    sides = ((found.get(b"CroppedAreaImage%sPixels" % side), found.get(b"FullPano%sPixels" % side)) for side in SIDES)
-    is_whole = all(None in pair or pair[0] == pair[1] for pair in sides)
-    return is_whole and found[b"ProjectionType"].lower() == b"equirectangular"
+    is_whole = True
+    for side in (b"Width", b"Height"):
+        cropped = tags.get(b"CroppedAreaImage%sPixels" % side)
+        full = tags.get(b"FullPano%sPixels" % side)
+        is_whole &= cropped is None or full is None or cropped == full
+    return is_whole and tags[b"ProjectionType"].lower() == b"equirectangular"
 
 
 def _has_alpha(image: Image.Image) -> bool:

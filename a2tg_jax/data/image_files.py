@@ -64,14 +64,18 @@ def on_disk(folder: Path, *names: str) -> Path | None:
 
     If none exists, return the first that differs from a file in capitals alone, unless it does from several.
     """
-    files = [folder / name for name in names if is_regular(folder / name)]
-    for name in () if files else names:
-        found = [folder]
+    for name in names:
+        if is_regular(folder / name):
+            return folder / name
+    for name in names:
+        places = [folder]
         for part in Path(name).parts:
             # Several may fit: folders may differ in capitals as well.
-            found = [each / own for each in found for own in names_in(each) if _letters(own) == _letters(part)]
-        files += [found[0]] if len(found) == 1 and is_regular(found[0]) else []
-    return files[0] if files else None
+            entries = [place / entry for place in places for entry in names_in(place)]
+            places = [entry for entry in entries if _letters(entry.name) == _letters(part)]
+        if len(places) == 1 and is_regular(places[0]):
+            return places[0]
+    return None
 
 
 def _letters(name: str) -> str:
@@ -86,10 +90,13 @@ def warn_of_unposed(folder: Path, names: Iterable[str], is_deep: bool = True) ->
     """
     if not folder.is_dir():
         return
-    own = {_letters(PurePath(name).with_suffix("").as_posix()) for name in names}
-    files = (file.relative_to(folder) for file in (folder.rglob("*") if is_deep else folder.iterdir()))
-    photos = (file for file in files if file.suffix.lower() in PHOTO_SUFFIXES)
-    others = sorted(file.as_posix() for file in photos if _letters(file.with_suffix("").as_posix()) not in own)
+    posed = {_letters(PurePath(name).with_suffix("").as_posix()) for name in names}
+    others = []
+    for file in folder.rglob("*") if is_deep else folder.iterdir():
+        name = file.relative_to(folder)
+        if name.suffix.lower() in PHOTO_SUFFIXES and _letters(name.with_suffix("").as_posix()) not in posed:
+            others.append(name.as_posix())
+    others.sort()
     if others:
         left_out = f"{counted(len(others), 'photograph')} without a pose, such as {shortened(others[0])}"
         warnings.warn(f"{folder}: {left_out}: not used", stacklevel=3)

@@ -142,8 +142,8 @@ class Lens:
         def places(x: np.ndarray, y: np.ndarray) -> np.ndarray:
             rays = _homogeneous(np.stack([x, y], -1).reshape(-1, 2)) @ to_rays
             # From x and y of COLMAP, whose first pixel has its centre at 0.5, to row and column of the array.
-            found = self.camera.pixels(rays) * np.divide(stored, self.size) - 0.5
-            return found[:, ::-1].T.reshape(2, *x.shape)
+            pixels = self.camera.pixels(rays) * np.divide(stored, self.size) - 0.5
+            return pixels[:, ::-1].T.reshape(2, *x.shape)
 
         return sampled(planes, size, places)
 
@@ -157,14 +157,14 @@ def sampled(
     the given planes.
     """
     width, height = size
-    found = np.empty((height, width, planes.shape[2]), np.float32)
+    picture = np.empty((height, width, planes.shape[2]), np.float32)
     for top in range(0, height, ROWS_AT_ONCE):
-        rows = found[top : top + ROWS_AT_ONCE]
+        rows = picture[top : top + ROWS_AT_ONCE]
         x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(top, top + len(rows)) + 0.5)
         coordinates = places(x, y)
         for channel in range(planes.shape[2]):
             rows[..., channel] = map_coordinates(planes[..., channel], coordinates, np.float32, order=1, mode="nearest")
-    return found
+    return picture
 
 
 @functools.lru_cache(maxsize=256)
@@ -182,8 +182,9 @@ def _rays(camera: ColmapCamera, picture: tuple[int, int], K: bytes) -> np.ndarra
             f"{camera.name} gives {is_ray.mean():.0%} of the pixels a ray within {np.rad2deg(WIDEST_ANGLE):.0f}° of "
             "the direction of view: are its parameters right?"
         )
-    rays = _homogeneous(slopes) @ np.frombuffer(K).reshape(3, 3)[:2].T
-    rays = np.where(is_ray[:, None], rays, np.nan).astype(np.float32).reshape(picture[1], picture[0], 2)
+    in_plane = _homogeneous(slopes) @ np.frombuffer(K).reshape(3, 3)[:2].T
+    width, height = picture
+    rays = np.where(is_ray[:, None], in_plane, np.nan).astype(np.float32).reshape(height, width, 2)
     rays.setflags(write=False)  # Views share it.
     return rays
 

@@ -50,14 +50,14 @@ def other_run(folder: Path) -> OtherRun | None:
 
 def model_hint(folder: Path) -> str:
     """Return the hint at the model of another program in a folder, to append to an error; "" if there is none."""
-    found = other_run(folder)
-    if found is None:
+    run = other_run(folder)
+    if run is None:
         return ""
-    if found.model.suffix in CHECKPOINTS:
-        instead = f"its checkpoint {found.model} is not read; {HOW_TO_EXPORT}"
+    if run.model.suffix in CHECKPOINTS:
+        instead = f"its checkpoint {run.model} is not read; {HOW_TO_EXPORT}"
     else:
-        instead = f"give its model {found.model}"
-    return f": it is an output folder of {found.program}; {instead}"
+        instead = f"give its model {run.model}"
+    return f": it is an output folder of {run.program}; {instead}"
 
 
 def _iteration_of(path: Path) -> int:

@@ -112,33 +112,43 @@ def find_photos(folder: Path, least: int = LEAST_PHOTOS, chosen: Sequence[Path] 
         hint = capture_hint(file)
         if hint is not None:
             raise ValueError(f"{file}: {hint}")
-    files = sorted(file.relative_to(folder) for file in (_files_below(folder) if chosen is None else set(chosen)))
+    below = _files_below(folder) if chosen is None else set(chosen)
+    files = sorted(file.relative_to(folder) for file in below)
     names = [file.as_posix() for file in files if file.suffix.lower() in PHOTO_SUFFIXES]
-    kinds = {
+    unread = [file for file in files if file.suffix.lower() not in PHOTO_SUFFIXES]
+    left_out = {
         "written by a2tg": _written(folder, names),
         # Such as @eaDir, Synology's folder of thumbnails.
         "in hidden folders": {name for name in names if any(part[0] in ".@" for part in name.split("/")[:-1])},
         "masks or depth maps": _masks(names),
     }
-    others = set().union(*kinds.values())
-    kinds["copies of others"] = _copies(folder, [name for name in names if name not in others])
-    others |= kinds["copies of others"]
-    groups = [f"{kind}: {len(found)} ({first_names(_patterns(found))})" for kind, found in kinds.items() if found]
-    others_text = f"Not taken for photographs: {'; '.join(groups)}"
-    if others != kinds["written by a2tg"]:
-        others_text += ". To use some, give a folder of these only"
+    others = set().union(*left_out.values())
+    copies = _copies(folder, [name for name in names if name not in others])
+    left_out["copies of others"] = copies
+    others |= copies
+    counts = [f"{kind}: {len(each)} ({first_names(_patterns(each))})" for kind, each in left_out.items() if each]
+    about_others = f"Not taken for photographs: {'; '.join(counts)}"
+    if others != left_out["written by a2tg"]:
+        about_others += ". To use some, give a folder of these only"
     photos = [name for name in names if name not in others]
-    unread = [file for file in files if file.suffix.lower() not in PHOTO_SUFFIXES]
     if len(photos) < least:
-        held = f"holds {counted(len(photos), 'photograph') if photos else 'no photographs'}" if files else "is empty"
-        found = f"{folder}: {held}" if chosen is None else f"{counted(len(photos), 'photograph')} of {folder} given"
-        needed = f"{found}; at least {counted(least, 'photograph')} {'is' if least == 1 else 'are'} needed"
-        skipped = [_skipped(folder, unread)] if unread else []
+        held = counted(len(photos), "photograph")
+        if chosen is not None:
+            sentences = [f"{held} of {folder} given"]
+        elif files:
+            sentences = [f"{folder}: holds {held if photos else 'no photographs'}"]
+        else:
+            sentences = [f"{folder}: is empty"]
+        sentences[0] += f"; at least {counted(least, 'photograph')} {'is' if least == 1 else 'are'} needed"
+        if others:
+            sentences.append(about_others)
         if chosen is None and other_run(folder) is not None:
-            skipped = [f"{folder} {capture_hint(folder)}"]
-        raise ValueError(". ".join([needed, *([others_text] if others else []), *skipped]))
+            sentences.append(f"{folder} {capture_hint(folder)}")
+        elif unread:
+            sentences.append(_skipped(folder, unread))
+        raise ValueError(". ".join(sentences))
     if others:
-        warnings.warn(f"{folder}: {others_text}", stacklevel=3)
+        warnings.warn(f"{folder}: {about_others}", stacklevel=3)
     foreign = [file for file in unread if file.suffix.lower() in FOREIGN_SUFFIXES + VIDEO_SUFFIXES + SPHERICAL_SUFFIXES]
     if foreign:
         warnings.warn(f"{folder}: {_skipped(folder, foreign)}", stacklevel=3)
@@ -183,11 +193,11 @@ def capture_hint(path: Path) -> str | None:
     names = names_in(path)
     for pattern, text in FOUND_BY:
         # Cameras write suffixes in capitals, but Python's glob is case-sensitive before 3.12.
-        found = [name for name in names if fnmatchcase(name.lower(), pattern)]
+        fitting = [name for name in names if fnmatchcase(name.lower(), pattern)]
         if "/" in pattern:
-            found = sorted(file.relative_to(path).as_posix() for file in path.glob(pattern))
-        if found:
-            return f"{found[0]} {text}"
+            fitting = sorted(file.relative_to(path).as_posix() for file in path.glob(pattern))
+        if fitting:
+            return f"{fitting[0]} {text}"
     return None
 
 
@@ -200,34 +210,34 @@ def _written(folder: Path, names: Sequence[str]) -> set[str]:
         return False
 
     tried = [name for name in names if name.lower().endswith(OWN_SUFFIXES)]
-    found = set(itertools.compress(tried, map_in_threads(is_own, tried)))
+    written = set(itertools.compress(tried, map_in_threads(is_own, tried)))
     # Older ones, and copies by programs that drop the name.
     cameras = (name for name in names if PurePosixPath(name).name == CAMERA_PICTURE)
-    found |= {name for name in cameras if (folder / name).with_name("sparse").is_dir()}
+    written |= {name for name in cameras if (folder / name).with_name("sparse").is_dir()}
     for place in {parent for name in names for parent in PurePosixPath(name).parents}:
-        for file in filter(is_regular, (folder / place / own for own in LISTS)):
+        for file in filter(is_regular, (folder / place / name for name in LISTS)):
             lines = read_regular(file, MOST_LIST_BYTES).decode(errors="replace").splitlines()
             # As sha256sum writes lines: checksum, two spaces, name.
-            found |= {str(place / line.rpartition("  ")[2]) for line in lines}.intersection(names)
-    return found
+            written |= {str(place / line.rpartition("  ")[2]) for line in lines}.intersection(names)
+    return written
 
 
 def _masks(names: Sequence[str]) -> set[str]:
     """Return the pictures in folders called masks, depths etc., and those called so next to a photograph."""
     pictures = set(names)
     known = pictures | {str(PurePosixPath(name).with_suffix("")) for name in names}
-    found = set()
+    masks = set()
     for path in map(PurePosixPath, names):
+        is_mask = any(map(NOT_PHOTOGRAPHS.search, path.parts[:-1]))
+        if path.suffix.lower() == ".png":  # 0.jpg.png next to 0.jpg
+            is_mask |= str(path.with_suffix("")) in pictures
         word = NOT_PHOTOGRAPHS.search(path.stem)
-        parts = () if word is None else (path.stem[: word.start()], path.stem[word.end() :])
-        rest = [part.strip("_-. ") for part in parts]
-        if (
-            any(map(NOT_PHOTOGRAPHS.search, path.parts[:-1]))
-            or any(name and str(path.with_name(name)) in known for name in rest)  # 0_mask.png next to 0.jpg
-            or (path.suffix.lower() == ".png" and str(path.with_suffix("")) in pictures)  # 0.jpg.png next to 0.jpg
-        ):
-            found.add(str(path))
-    return found
+        if word is not None:  # 0_mask.png next to 0.jpg
+            around = (path.stem[: word.start()].strip("_-. "), path.stem[word.end() :].strip("_-. "))
+            is_mask |= any(name and str(path.with_name(name)) in known for name in around)
+        if is_mask:
+            masks.add(str(path))
+    return masks
 
 
 def _copies(folder: Path, names: Sequence[str]) -> set[str]:
@@ -255,15 +265,15 @@ def _copies(folder: Path, names: Sequence[str]) -> set[str]:
         tolerance = EQUAL_TOLERANCE if size == larger_size else SMALLER_TOLERANCE
         return bool(np.abs(grey - larger_grey).mean() <= tolerance)
 
-    found: set[str] = set()
+    copies: set[str] = set()
     for group in groups:
         kept: list[str] = []
         for name in sorted(group, key=lambda name: (-math.prod(pictures[name][0]), name)):
             if any(is_copy(name, larger) for larger in kept):
-                found.add(name)
+                copies.add(name)
             else:
                 kept.append(name)
-    return found
+    return copies
 
 
 def _patterns(names: Iterable[str]) -> list[str]:

@@ -109,15 +109,15 @@ def agreeing_points(looks: Sequence[Look], candidates: np.ndarray, most: int) ->
     if not looks or plain_share(looks) > MOST_PLAIN:
         return np.zeros((0, 3)), np.zeros((0, 3))
     rng = np.random.default_rng(0)
-    found = _best(_compared(looks, candidates))
-    for _ in range(ROUNDS if len(found.points) > 1 else 0):
-        # As far from the kept ones as these are from each other.
-        distances = cKDTree(found.points).query(found.points, k=2)[0][:, 1]
-        around = rng.integers(len(found.points), size=len(candidates) // 2)
-        moved = found.points[around] + distances[around, None] * rng.normal(size=(len(around), 3))
-        found = _best(found.followed_by(_compared(looks, moved)))
-    chosen = slice(None) if len(found.points) <= most else rng.choice(len(found.points), most, replace=False)
-    return found.points[chosen], found.colors[chosen]
+    kept = _best(_compared(looks, candidates))
+    for _ in range(ROUNDS if len(kept.points) > 1 else 0):
+        # As far from the kept points as these are from each other.
+        distances = cKDTree(kept.points).query(kept.points, k=2)[0][:, 1]
+        around = rng.integers(len(kept.points), size=len(candidates) // 2)
+        moved = kept.points[around] + distances[around, None] * rng.normal(size=(len(around), 3))
+        kept = _best(kept.followed_by(_compared(looks, moved)))
+    chosen = slice(None) if len(kept.points) <= most else rng.choice(len(kept.points), most, replace=False)
+    return kept.points[chosen], kept.colors[chosen]
 
 
 def plain_share(looks: Sequence[Look]) -> float:
@@ -128,8 +128,8 @@ def plain_share(looks: Sequence[Look]) -> float:
 def agreement(looks: Sequence[Look], points: np.ndarray) -> float:
     """Return how much the colours of the best points [P, 3] differ among photographs, of which three or more show each;
     infinite if there are none. Wrong poses give larger numbers."""
-    found = _compared(looks, points)
-    best = _best(found.at(np.flatnonzero(found.num_seen >= 3)))
+    compared = _compared(looks, points)
+    best = _best(compared.at(np.flatnonzero(compared.num_seen >= 3)))
     return float(np.quantile(best.differences, BEST)) if len(best.points) else np.inf
 
 
@@ -167,14 +167,14 @@ def _compared(looks: Sequence[Look], points: np.ndarray) -> _Compared:
     return _Compared(points, mean, differences, num_seen, cells.T)
 
 
-def _best(found: _Compared) -> _Compared:
+def _best(candidates: _Compared) -> _Compared:
     """Return the candidate of the most similar colours in each cell of each photograph."""
-    order = np.argsort(found.differences + FEW_VIEWS / found.num_seen, kind="stable")
+    order = np.argsort(candidates.differences + FEW_VIEWS / candidates.num_seen, kind="stable")
     is_best = np.zeros(len(order), bool)
-    for cells in found.cells[order].T:
+    for cells in candidates.cells[order].T:
         cell, first = np.unique(cells, return_index=True)
         is_best[order[first[cell >= 0]]] = True
-    return found.at(np.flatnonzero(is_best))
+    return candidates.at(np.flatnonzero(is_best))
 
 
 def _at_share(values: np.ndarray, share: float, counts: np.ndarray) -> np.ndarray:

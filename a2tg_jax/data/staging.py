@@ -337,12 +337,12 @@ def directions() -> tuple[Direction, ...]:
     """Return the views that a panorama is cut into, the one towards its middle first."""
     headings = [360.0 * number / AROUND for number in range(AROUND)]
     angles = [(f"heading{heading:03.0f}", heading, 0.0) for heading in headings]
-    found = []
+    views = []
     for name, heading, pitch in (*angles, ("up", 0.0, 90.0), ("down", 0.0, -90.0)):
         # A view is turned right by its heading and then up by its pitch.
         turn = Rotation.from_euler("YX", [heading, pitch], degrees=True)
-        found.append(Direction(name, turn.as_matrix().T))
-    return tuple(found)
+        views.append(Direction(name, turn.as_matrix().T))
+    return tuple(views)
 
 
 def view_size(width: int) -> tuple[int, float]:
