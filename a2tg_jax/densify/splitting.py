@@ -5,8 +5,8 @@ detail is missing. Here the weight of a host is the change of the loss by a move
 halves, each at a point drawn from the host and 1.6 times smaller, as in adaptive density control (`densify`).
 
 The low-pass filter draws every splat at least as large as itself. Two halves of a smaller splat that kept its opacity
-would cover the same pixels and be about twice as opaque together; two halves of a large splat cover 2/1.6² = 0.78 of
-its area. So halves share opacity in proportion to what the filter adds to their area (`logits_of_halves`).
+would cover the same pixels and be about twice as opaque together, whereas two halves of a large splat cover 2/1.6² =
+0.78 of its area. So halves share opacity in proportion to what the filter adds to their area (`logits_of_halves`).
 
 Hosts are drawn without replacement. A splat at an outlying point covers whole views, so its weight is thousands of
 times larger than others: with replacement it would be the host of nearly all new Gaussians.

@@ -58,15 +58,15 @@ def composite(
         def on(platform: str) -> Any:
             return functools.partial(xla.composite_in_any_mode, _batched_on(platform, settings))
 
-        # JAX differentiates the code itself, which it must therefore trace for all platforms.
+        # Not `by_platform`, because JAX differentiates the code itself, and must trace it for all platforms.
         per_platform = {"cpu": on("cpu")} if settings.tile_batch is None else {}
         images = jax.lax.platform_dependent(inputs, default=on("other"), **per_platform)
     else:
         mark = functools.partial(_reverse_only, settings.compositor)
         splats, texels, probe = jax.tree.map(mark, (splats, texels, probe))
         images = _composite_tiles(settings, splats, texels, regions, cutoff, lists, jacobian, probe)
-    channels, transmittance = (_assemble(image, settings.grid) for image in images)
-    return channels, transmittance
+    channels, transmittance = images
+    return _assemble(channels, settings.grid), _assemble(transmittance, settings.grid)
 
 
 def _assemble(tiles: Array, grid: TileGrid) -> Array:
@@ -89,10 +89,13 @@ def list_tiles(
     """
     if pixels is not None:
         return tiles.tile_lists(M, cutoff, near_plane, grid, capacity, pixels)
-    integers = [jax.ShapeDtypeStruct((num,), jnp.int32) for num in (capacity, grid.num + 1)]
-    results = (*integers, jax.ShapeDtypeStruct((), jnp.float32), jax.ShapeDtypeStruct((), jnp.bool_))
-    found = by_platform(_lists_on, (compositor, near_plane, grid, capacity), results, M, cutoff)
-    return TileLists(*found)
+    results = (
+        jax.ShapeDtypeStruct((capacity,), jnp.int32),
+        jax.ShapeDtypeStruct((grid.num + 1,), jnp.int32),
+        jax.ShapeDtypeStruct((), jnp.float32),
+        jax.ShapeDtypeStruct((), jnp.bool_),
+    )
+    return TileLists(*by_platform(_lists_on, (compositor, near_plane, grid, capacity), results, M, cutoff))
 
 
 def _lists_on(platform: str, compositor: Wanted, near_plane: float, grid: TileGrid, capacity: int) -> Any:
@@ -117,8 +120,8 @@ _composite_tiles = jax.custom_vjp(_forward, nondiff_argnums=(0,))
 
 
 def _composite_tiles_fwd(settings: PassSettings, *arrays: Any) -> tuple[tuple[Array, Array], tuple[Any, ...]]:
-    shown = _forward(settings, *arrays)
-    return shown, (*arrays, *shown)
+    images = _forward(settings, *arrays)
+    return images, (*arrays, *images)
 
 
 def _composite_tiles_bwd(
@@ -128,28 +131,31 @@ def _composite_tiles_bwd(
     g, g_transmittance = cotangents
     # B of the whole list: Σ g·c·α·T over the splats is g·channels, and what is behind them has weight T.
     suffix_sum = jnp.sum(g * channels, axis=1) + g_transmittance * transmittance
-    inputs, jacobian, probe = PassInputs(*arrays[:5]), *arrays[5:]
+    inputs = PassInputs(*arrays[:5])
+    jacobian, probe = arrays[5:]
     differentiated = inputs.splats, inputs.texels, probe
     results = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), differentiated)
-    found = _by_platform("backward", settings, results, inputs, jacobian, probe, g, suffix_sum)
-    d_splats, d_texels, d_probe = cotangent_of(differentiated, found)
+    gradients = _by_platform("backward", settings, results, inputs, jacobian, probe, g, suffix_sum)
+    d_splats, d_texels, d_probe = cotangent_of(differentiated, gradients)
     return d_splats, d_texels, None, None, None, None, d_probe
 
 
 _composite_tiles.defvjp(_composite_tiles_fwd, _composite_tiles_bwd)
 
 
-def _by_platform(which: str, settings: PassSettings, results: Any, *arrays: object) -> Any:
+def _by_platform(name: str, settings: PassSettings, results: Any, *arrays: object) -> Any:
+    """Call the function `forward` or `backward` of the kernels of the platform."""
     advice = ADVICE.format(compositor=settings.compositor)
-    return by_platform(_pass_on, (which, settings), results, *arrays, advice=advice)
+    return by_platform(_pass_on, (name, settings), results, *arrays, advice=advice)
 
 
-def _pass_on(platform: str, which: str, settings: PassSettings) -> Any:
+def _pass_on(platform: str, name: str, settings: PassSettings) -> Any:
     kernels = _kernels(settings.compositor, platform)
-    if kernels is not xla and (reason := kernels.refusal(settings.kernel)):
+    reason = None if kernels is xla else kernels.refusal(settings.kernel)
+    if reason:
         instead_of(settings.compositor, type(settings.static.appearance), reason)
         kernels = xla
-    return functools.partial(getattr(kernels, which), _batched_on(platform, settings))
+    return functools.partial(getattr(kernels, name), _batched_on(platform, settings))
 
 
 def _kernels(compositor: Wanted, platform: str) -> Any:

@@ -173,7 +173,7 @@ def show(
     alpha = jnp.where(is_hidden, 0.0, jnp.where(a > functions.max_alpha, functions.max_alpha, a))
     channels: tuple[Array, ...] = splat.color
     if tint is not None:
-        channels = tuple(base * own for base, own in zip(channels, tint, strict=True))
+        channels = tuple(base * scale for base, scale in zip(channels, tint, strict=True))
     if residual is not None:
         channels = tuple(base + extra for base, extra in zip(channels, residual, strict=True))
     if splat.normal is not None:
@@ -192,20 +192,20 @@ def absorb(alpha: Array, transmittance: Array, is_live: Array) -> Triple:
 
 
 def absorb_vjp(
-    alpha: Array, transmittance: Array, is_live: Array, suffix_sum: Array, shown: Array
+    alpha: Array, transmittance: Array, is_live: Array, suffix_sum: Array, g_dot_c: Array
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return the results of `absorb` and ∂L/∂α, walking front to back.
 
     B = Σ g·c·α·T over the splats behind + g_T·T_final is linear in 1 − α of this splat, so that
     ∂L/∂α = T·(g·c) − B/(1 − α). Nothing is stored per pixel and splat, and α never reaches 1.
 
-    `suffix_sum` is B with this splat's own g·c·α·T still in it, `shown` is g·c. The results are weight, transmittance
-    and liveness behind the splat, B of the splats behind it, and ∂L/∂α.
+    `suffix_sum` is B with this splat's g·c·α·T still in it. The results are weight, transmittance and liveness behind
+    the splat, B of the splats behind it, and ∂L/∂α.
     """
-    weight, after, live_after = absorb(alpha, transmittance, is_live)
-    suffix_sum = suffix_sum - weight * shown
-    d_alpha = jnp.where(live_after, transmittance * shown - suffix_sum / (1 - alpha), 0.0)
-    return weight, after, live_after, suffix_sum, d_alpha
+    weight, transmittance_behind, is_live_behind = absorb(alpha, transmittance, is_live)
+    suffix_sum = suffix_sum - weight * g_dot_c
+    d_alpha = jnp.where(is_live_behind, transmittance * g_dot_c - suffix_sum / (1 - alpha), 0.0)
+    return weight, transmittance_behind, is_live_behind, suffix_sum, d_alpha
 
 
 class Cotangents(NamedTuple):
@@ -252,9 +252,9 @@ def blend_vjp(
     values = () if lookup is None else lookup.sample.values
     floats = planes, splat.opacity, splat.color, splat.normal, splat.numbers, values, rho_probe
     shown, pull_back = jax.vjp(of_floats, *floats)
-    seen: Any = sum(g_k * channel for g_k, channel in zip(g, shown.channels, strict=True))
+    g_dot_c: Any = sum(g_k * channel for g_k, channel in zip(g, shown.channels, strict=True))
     weight, transmittance, is_live, suffix_sum, d_alpha = absorb_vjp(
-        shown.alpha, transmittance, is_live, suffix_sum, seen
+        shown.alpha, transmittance, is_live, suffix_sum, g_dot_c
     )
     cotangents = Cotangents(*pull_back(Shown(d_alpha, tuple(weight * g_k for g_k in g))))
     return (transmittance, is_live, suffix_sum), weight, cotangents

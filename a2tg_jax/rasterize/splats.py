@@ -27,8 +27,10 @@ Wanted = Literal["auto", "cuda", "native", "xla", "autodiff"]
 """A compositor, or the first of native loops, CUDA kernels and XLA that runs on the platform that JAX compiles for."""
 
 
-LARGEST_DEPTH, LARGEST_AXIS = 1e18, 1e12
-"""Magnitudes up to which homographies are exact: beyond, products and their gradients would overflow float32."""
+LARGEST_DEPTH = 1e18
+"""Largest depth of a homography; products of larger ones and their gradients would overflow float32."""
+LARGEST_AXIS = 1e12
+"""Largest entry of its first two columns, for the same reason."""
 
 
 class Splats(NamedTuple):
@@ -147,7 +149,7 @@ def project_gaussians(
     is_broken = ~(cutoff <= 0) & ~functools.reduce(jnp.logical_and, map(jnp.isfinite, columns))
     cutoff = jnp.where(is_broken, jnp.nan, cutoff)
     is_shown = (cutoff > 0)[:, None]
-    # Invisible rows may hold anything; finite stand-ins keep 0 · inf out of the sums and the gradients.
+    # Invisible rows may not be finite; stand-ins keep 0 · inf out of the sums and the gradients.
     M = jnp.where(is_shown[:, None], M, jnp.eye(3, dtype=M.dtype)[None])
     colors, normals, numbers = (jnp.where(is_shown, x, 0.0) for x in (colors, normals, numbers))
     return Splats(M, colors, opacities, normals, numbers), cutoff
@@ -175,11 +177,13 @@ def settings_of_pass(
       ValueError: if the appearance gives texture regions of another number of splats or a `max_alpha` outside (0, 1),
         or if its element-wise functions return something else than they must.
     """
-    (texels, regions), name, num = appearance.atlas(), type(appearance).__name__, splats.opacities.shape[0]
-    for field, given in {} if regions is None else regions._asdict().items():
-        if given.shape != (num,):
+    texels, regions = appearance.atlas()
+    name = type(appearance).__name__
+    num = splats.opacities.shape[0]
+    for field, numbers in () if regions is None else regions._asdict().items():
+        if numbers.shape != (num,):
             raise ValueError(
-                f"an appearance gives regions.{field} [N] of N = {num} gaussians; {name} gave {given.shape}"
+                f"an appearance gives regions.{field} [N] of N = {num} gaussians; {name} gave {numbers.shape}"
             )
     if not 0 < appearance.alpha_limit < 1:
         raise ValueError(f"max_alpha of an appearance must be in (0, 1); in {name} it is {appearance.alpha_limit}")
@@ -240,10 +244,10 @@ def unpack_splats(packed: Array, like: Splats, has_geometry: bool) -> Splats:
 
 
 def unpack_gradients(
-    settings: PassSettings, found: Sequence[Array], inputs: PassInputs, probe: Array
+    settings: PassSettings, gradients: Sequence[Array], inputs: PassInputs, probe: Array
 ) -> tuple[Splats, Array, Array]:
     """Unpack a kernel's gradients, of `PassSettings.gradient_shapes`, as gradients of splats, texels and probe."""
-    packed, d_texels, d_probe = found
+    packed, d_texels, d_probe = gradients
     d_splats = unpack_splats(packed, inputs.splats, settings.has_geometry)
     d_probe = d_probe.astype(probe.dtype) if settings.statistic else jnp.zeros_like(probe)
     return d_splats, d_texels.astype(inputs.texels.dtype), d_probe

@@ -72,11 +72,11 @@ def _fitted(places: Array, is_seen: Array, tile_size: int) -> tuple[Array, Array
 
     # Least squares, place ≈ centre + J·pixel: J = Σ place·pixelᵀ (Σ pixel·pixelᵀ)⁻¹, both about their means. The prior
     # adds a multiple of the unit matrix to both sums, which leads to J = 1 where pixels do not determine it.
-    (_, pixels), (centers, places) = about_mean(pixels), about_mean(places)
+    _, pixels = about_mean(pixels)
+    centers, places = about_mean(places)
     prior = PRIOR * num[:, None, None] * jnp.eye(2, dtype=places.dtype)[None]
-    covariance, spread = (
-        jnp.einsum("tip,tjp->tij", own, pixels, precision="highest") + prior for own in (places, pixels)
-    )
+    covariance = jnp.einsum("tip,tjp->tij", places, pixels, precision="highest") + prior
+    spread = jnp.einsum("tip,tjp->tij", pixels, pixels, precision="highest") + prior
     return centers, covariance @ jnp.linalg.inv(spread)
 
 
@@ -90,10 +90,10 @@ def covered_tiles(
     margins = (reach * pixels.magnifications)[:, None]
     edges = pixels.boxes[:, :2] - margins, pixels.boxes[:, 2:] + margins
     begins, ends = (edge.reshape(-1, num_columns, 2) for edge in edges)
-    found = []
+    spans = []
     for axis in range(2):  # Over the rows for the columns, over the columns for the rows.
-        # Lenses bend rows and columns, so that spans overlap and need not be in order. The largest end so far and the
-        # least begin from here on are, and contain them: they can be searched by halves.
+        # Lenses bend rows and columns, so that their spans overlap and may be out of order. The largest end so far and
+        # the least begin from here on are in order, for a binary search, and contain the spans.
         begun = jnp.min(begins[..., axis], axis=axis)
         reached = jnp.max(ends[..., axis], axis=axis)
         begun = jax.lax.cummin(begun, reverse=True)
@@ -101,5 +101,5 @@ def covered_tiles(
         first = jnp.searchsorted(reached, low[axis], side="left").astype(jnp.int32)
         end = jnp.searchsorted(begun, high[axis], side="right").astype(jnp.int32)
         is_covered = (low[axis] <= high[axis]) & (first < end)
-        found.append((jnp.where(is_covered, first, 0), jnp.where(is_covered, end - first, 0)))
-    return tuple(found)
+        spans.append((jnp.where(is_covered, first, 0), jnp.where(is_covered, end - first, 0)))
+    return tuple(spans)

@@ -147,7 +147,7 @@ def tile_lists(
     rectangles = jax.tree.map(lambda x: x[order], unordered)
     # The total is known to a relative error of about 2⁻²⁰.
     overflow = total + jnp.floor(total * 2.0**-20) > capacity
-    # Empty lists instead of some that lack splats: an image that is plainly wrong, at no cost.
+    # Empty lists, not incomplete ones, so that an overflow makes an image that is plainly wrong.
     counts = jnp.where(overflow, 0, rectangles.counts)
     ends = jnp.cumsum(counts)
     num = depths.shape[0]
@@ -167,11 +167,11 @@ def tile_lists(
         tile_y = (y * grid.tile_size).astype(dtype)
         is_touched = outline_touches(per_pair, tile_x, tile_y, grid.tile_size)
     else:
-        # Places that are left may be in no tile.
-        own = jnp.minimum(y * grid.columns + x, grid.num - 1)
-        left, top, right, bottom = pixels.boxes[own].T
-        # The radius of the low-pass filter is in pixels of the image: here as long as they are in the image plane.
-        outline = per_pair._replace(radius=per_pair.radius * pixels.magnifications[own])
+        # Places that are left over may be in no tile.
+        tile = jnp.minimum(y * grid.columns + x, grid.num - 1)
+        left, top, right, bottom = pixels.boxes[tile].T
+        # The radius of the low-pass filter is in pixels of the image; the boxes are in the image plane.
+        outline = per_pair._replace(radius=per_pair.radius * pixels.magnifications[tile])
         is_touched = _touches(outline, lambda x, y: (left - x, right - x, top - y, bottom - y))
     # Pairs that are not kept sort behind all tiles.
     is_kept = (position < ends[-1]) & is_touched

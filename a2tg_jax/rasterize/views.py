@@ -201,7 +201,7 @@ def _jitted_count() -> jax.stages.Wrapped:
         M, cutoff = jax.lax.stop_gradient(drawn_splats(gaussians, camera, appearance, num_live))
         grid = TileGrid(camera.width, camera.height, tile_size)
         pixels = None if camera.rays is None else tile_pixels(camera.rays, tile_size)
-        # Whatever composites later, and wherever: the number is the same.
+        # Every compositor counts the same pairs.
         return list_tiles("auto", M, cutoff, near_plane, grid, 0, pixels).num_pairs
 
     return jax.jit(count, static_argnums=(3, 4))

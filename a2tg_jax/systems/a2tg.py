@@ -108,8 +108,8 @@ class A2tg(TwoStages):
         if self.texture_share is None:
             # Up to half of the largest texture.
             return self._floats(min(BUDGET_TEXELS, (least + most) / 2))
-        own = floats_per_gaussian(self.sh_degree) + self._floats(0)
-        texels = own * self.texture_share / (1 - self.texture_share) / FLOATS_PER_TEXEL
+        floats = floats_per_gaussian(self.sh_degree) + self._floats(0)
+        texels = floats * self.texture_share / (1 - self.texture_share) / FLOATS_PER_TEXEL
         return self._floats(min(max(texels, least), most))
 
     @classmethod

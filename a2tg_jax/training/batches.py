@@ -80,16 +80,19 @@ class BatchOrder:
 
     def __init__(self, views: tuple[View, ...], batch_size: int, seed: int, number: int = 0):
         """`number` selects one of the orders of a seed, from 0."""
-        self.kinds, self._batch_size = kinds_of(views), batch_size
+        self.kinds = kinds_of(views)
         """Image size and lens of each view."""
+        self._batch_size = batch_size
         self._seeds = (seed, number) if number else (seed,)
-        self._epoch, self._batches = -1, self._draw(0)
+        self._epoch = 0
+        self._batches = self._draw(0)
 
     def indices(self, iteration: int) -> tuple[int, ...]:
         """Return the views of an iteration (from 1)."""
         epoch, position = divmod(iteration - 1, len(self._batches))
         if epoch != self._epoch:
-            self._epoch, self._batches = epoch, self._draw(epoch)
+            self._epoch = epoch
+            self._batches = self._draw(epoch)
         return self._batches[position]
 
     def _draw(self, epoch: int) -> list[tuple[int, ...]]:
@@ -171,7 +174,9 @@ class PhotoStore:
         """Views of each kind, in the order of its stack."""
         for index, kind in enumerate(order.kinds):
             self._of_kind.setdefault(kind, []).append(index)
-        self._places = {index: place for found in self._of_kind.values() for place, index in enumerate(found)}
+        self._places: dict[int, int] = {}
+        for indices in self._of_kind.values():
+            self._places.update(zip(indices, range(len(indices)), strict=True))
         self._ahead = Ahead(self._read, self.num_ahead)
         # All processes must launch the same program, so one without room makes all stream.
         self.is_resident = not any_process(mesh, not plan.is_resident)
@@ -229,14 +234,14 @@ class Ahead:
         self._pool = ThreadPoolExecutor(min(num_ahead, num_threads()), thread_name_prefix="photographs")
         self._batches: dict[int, Future[Photographs]] = {}
 
-    def first(self, wanted: dict[int, tuple[int, ...]]) -> Photographs:
-        """Return the first of the wanted batches, by iteration, and prepare the others."""
-        for iteration in self._batches.keys() - wanted.keys():
+    def first(self, following: dict[int, tuple[int, ...]]) -> Photographs:
+        """Return the first of the following batches, by iteration, and prepare the others."""
+        for iteration in self._batches.keys() - following.keys():
             self._batches.pop(iteration).cancel()
-        for iteration, indices in wanted.items():
+        for iteration, indices in following.items():
             if iteration not in self._batches:
                 self._batches[iteration] = self._pool.submit(self._load, indices)
-        return self._batches[next(iter(wanted))].result()
+        return self._batches[next(iter(following))].result()
 
     def close(self) -> None:
         """End the threads when their present batches are done."""
@@ -283,7 +288,8 @@ def stack_views(views: list[View], among: tuple[View, ...] | None = None, *, has
     if has_depths:
         unknown = np.full(size, np.nan, np.float32)
         depths = stacked([unknown if view.depth is None else view.depth.read() for view in views], np.float32)
-    viewmats, Ks = (np.stack([np.asarray(getattr(view.camera, name)) for view in views]) for name in ("viewmat", "K"))
+    viewmats: Any = np.stack([np.asarray(view.camera.viewmat) for view in views])
+    Ks: Any = np.stack([np.asarray(view.camera.K) for view in views])
     images = stacked([picture[..., :3] for picture in pixels], channels=(3,))
     rays: Any = views[0].camera.rays
-    return Photographs(viewmats, Ks, images, alphas, masks, depths, rays)  # type: ignore[arg-type]
+    return Photographs(viewmats, Ks, images, alphas, masks, depths, rays)

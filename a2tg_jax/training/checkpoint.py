@@ -65,8 +65,8 @@ class History(NamedFields):
 
     def to_dict(self) -> dict[str, np.ndarray]:
         """Return the columns by name, as `pandas.DataFrame` takes them; loss terms as loss_l1 and so on."""
-        own = {name: getattr(self, name) for name in COLUMNS}
-        return own | {f"{TERM}{name}": values for name, values in self.terms.items()}
+        columns = {name: getattr(self, name) for name in COLUMNS}
+        return columns | {f"{TERM}{name}": values for name, values in self.terms.items()}
 
     @property
     def last_seconds(self) -> float:
@@ -76,25 +76,30 @@ class History(NamedFields):
     def of_rows(rows: Sequence[Mapping[str, float]]) -> "History":
         """Return the history of rows, which map column names to values; NaN for a loss term that a row lacks."""
         names = dict.fromkeys([*COLUMNS, *(name for row in rows for name in row)])
-        kinds = {name: column.dtype for name, column in History.empty().to_dict().items()}
-        return History.of_columns(
-            {name: np.asarray([row.get(name, np.nan) for row in rows], kinds.get(name, np.float64)) for name in names}
-        )
+        empty = History.empty().to_dict()
+        columns = {}
+        for name in names:
+            dtype = empty[name].dtype if name in empty else np.float64
+            columns[name] = np.asarray([row.get(name, np.nan) for row in rows], dtype)
+        return History.of_columns(columns)
 
     @staticmethod
     def of_columns(columns: Mapping[str, np.ndarray]) -> "History":
         """Return the history of columns, the inverse of `to_dict`."""
         terms = {name.removeprefix(TERM): column for name, column in columns.items() if name not in COLUMNS}
-        known: dict[str, Any] = {name: columns[name] for name in COLUMNS}
-        return History(**known, terms=terms)
+        fields: dict[str, Any] = {name: columns[name] for name in COLUMNS}
+        return History(**fields, terms=terms)
 
     def followed_by(self, other: "History") -> "History":
         """Return this history, continued by another."""
-        both = [(history.to_dict(), np.full(len(history.iteration), np.nan)) for history in (self, other)]
-        names = {**both[0][0], **both[1][0]}
-        return History.of_columns(
-            {name: np.concatenate([columns.get(name, none) for columns, none in both]) for name in names}
-        )
+        first = self.to_dict()
+        second = other.to_dict()
+        missing = np.full(len(self.iteration), np.nan)
+        other_missing = np.full(len(other.iteration), np.nan)
+        columns = {}
+        for name in first | second:
+            columns[name] = np.concatenate([first.get(name, missing), second.get(name, other_missing)])
+        return History.of_columns(columns)
 
 
 COLUMNS = tuple(field.name for field in dataclasses.fields(History) if field.name != "terms")
@@ -186,8 +191,8 @@ def save_checkpoint(path: str | os.PathLike[str], checkpoint: Checkpoint) -> Non
         "terms": [*checkpoint.history.terms],
         "views": None if checkpoint.views is None else checkpoint.views.names,
     }
-    shown = arrays_of(model.appearance, model.gaussians.sh_degree)
-    arrays = {f"{SHOWN}{name}": array for name, array in shown.items()}
+    of_appearance = arrays_of(model.appearance, model.gaussians.sh_degree)
+    arrays = {f"{SHOWN}{name}": array for name, array in of_appearance.items()}
     if checkpoint.views is not None:
         arrays |= {f"{VIEWS}{name}": array for name, array in checkpoint.views.arrays.items()}
     state = dataclasses.replace(state, moments=_packed(model, state.moments))
@@ -229,24 +234,23 @@ def _checkpoint_of(header: dict[str, Any], arrays: dict[str, np.ndarray], option
     # Any leaves: only the paths of the fields count.
     (gaussians,) = _filled((Gaussians(*range(5)),), arrays)
     check_gaussians(gaussians)
-    shown = {name.removeprefix(SHOWN): array for name, array in arrays.items() if name.startswith(SHOWN)}
-    appearance = with_arrays(stage.appearance, shown, gaussians.sh_degree)
+    appearance = with_arrays(stage.appearance, _with_prefix(SHOWN, arrays), gaussians.sh_degree)
     gaussians = jax.tree.map(jnp.asarray, gaussians)
     check_appearance(appearance, gaussians)
     model = Model(gaussians, appearance, jnp.zeros((), jnp.int32))
     # Shapes only; nothing is allocated.
-    wanted: TrainState = jax.eval_shape(lambda: initial_state(stage, model, [""]))
-    events = (event if ahead else None for event, ahead in zip(wanted.events, is_ahead, strict=True))
-    wanted = dataclasses.replace(wanted, events=tuple(events))
+    expected: TrainState = jax.eval_shape(lambda: initial_state(stage, model, [""]))
+    events = (event if ahead else None for event, ahead in zip(expected.events, is_ahead, strict=True))
+    expected = dataclasses.replace(expected, events=tuple(events))
     terms = header["terms"]
     if not isinstance(terms, list) or not all(isinstance(name, str) for name in terms):
         raise ValueError(f"terms must be a list of names; got {shortened(terms)}")
-    kept = _rest(wanted), dict.fromkeys(COLUMNS, 0) | {"terms": dict.fromkeys(terms, 0)}
-    _, (rest, columns) = _filled((gaussians, kept), arrays)
+    template = _rest(expected), dict.fromkeys(COLUMNS, 0) | {"terms": dict.fromkeys(terms, 0)}
+    _, (rest, columns) = _filled((gaussians, template), arrays)
     moments, num_live, *others = jax.tree.map(jnp.asarray, rest)
     state = TrainState(Model(gaussians, appearance, num_live), moments, *others)
     history = History(**columns)
-    check_state(state, wanted, stage)
+    check_state(state, expected, stage)
     check_history(history)
     counts = {name: header[name] for name in ("num_restored", "num_refused")}
     for name, count in counts.items():
@@ -255,8 +259,7 @@ def _checkpoint_of(header: dict[str, Any], arrays: dict[str, np.ndarray], option
     devices = config_from_dict(Devices, header["devices"], "devices")
     views = None
     if header.get("views") is not None:  # Checkpoints of earlier versions do not record them.
-        own = {name.removeprefix(VIEWS): array for name, array in arrays.items() if name.startswith(VIEWS)}
-        views = RecordedViews.of_arrays(header["views"], own)
+        views = RecordedViews.of_arrays(header["views"], _with_prefix(VIEWS, arrays))
     return Checkpoint(options, index, state, history, machine=machine, devices=devices, views=views, **counts)
 
 
@@ -289,17 +292,21 @@ def _packed(model: Model, moments: AdamState) -> AdamState:
     return dataclasses.replace(moments, mu=packed(moments.mu), nu=packed(moments.nu))
 
 
+def _with_prefix(prefix: str, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+
+
 def _filled(template: object, arrays: dict[str, np.ndarray]) -> Any:
     """Return a tree of the template's structure with the array of its path at each leaf."""
     return jax.tree_util.tree_map_with_path(lambda path, _: arrays[jax.tree_util.keystr(path)], template)
 
 
-def check_state(state: TrainState, wanted: TrainState, stage: Stage) -> None:
-    """Raise ValueError, naming the leaf, unless a file's state, whose model's arrays fit each other, has the shapes and
-    dtypes of a state of that stage and model."""
-    check_like("state.model.num_live", state.model.num_live, wanted.model.num_live)
+def check_state(state: TrainState, expected: TrainState, stage: Stage) -> None:
+    """Raise ValueError, naming the leaf, unless the state of a file, whose model is valid, has the shapes and dtypes of
+    the expected one."""
+    check_like("state.model.num_live", state.model.num_live, expected.model.num_live)
     for name in ("moments", "events", "iteration", "status"):
-        check_like(f"state.{name}", getattr(state, name), getattr(wanted, name))
+        check_like(f"state.{name}", getattr(state, name), getattr(expected, name))
     check_model(state.model)
     check_count("state.iteration", state.iteration, stage.iterations)
     check_count("state.status", state.status, EXPLODED)
@@ -311,11 +318,11 @@ def check_state(state: TrainState, wanted: TrainState, stage: Stage) -> None:
     dtype = state.model.gaussians.means.dtype
     neutral = jax.eval_shape(lambda: initial_corrections(stage.corrections, names, None, dtype))
     check_like("state.corrections", state.corrections, neutral)
-    for known in state.corrections:
-        check_finite("state.corrections.rows", known.rows)
-        check_finite("state.corrections.mu", known.moments.mu)
-        check_finite("state.corrections.nu", known.moments.nu, is_signed=False)
-        if (np.asarray(known.moments.count) < 0).any():
+    for correction in state.corrections:
+        check_finite("state.corrections.rows", correction.rows)
+        check_finite("state.corrections.mu", correction.moments.mu)
+        check_finite("state.corrections.nu", correction.moments.nu, is_signed=False)
+        if (np.asarray(correction.moments.count) < 0).any():
             raise ValueError("state.corrections.count must be at least 0; some are below")
     for path, leaf in jax.tree_util.tree_leaves_with_path(state.events):
         if np.isnan(np.asarray(leaf)).any():
@@ -353,21 +360,22 @@ def check_resume(resume: Checkpoint, system: System, index: int) -> None:
             )
     if resume.system == dataclasses.replace(system, more=system.more[: len(resume.system.more)]):
         return
-    before = type(resume.system)
-    now = type(system)
+    trained = type(resume.system)
+    given = type(system)
     advice = ""
     values = flatten_config(resume.system)
     others = flatten_config(system)
-    if before is now:
+    if trained is given:
         pairs = {name: (values[name], others[name]) for name in values if values[name] != others[name]}
         differing = ", ".join(f"{name} {value!r}, not {other!r}" for name, (value, other) in pairs.items())
         if any(name.endswith("iterations") for name in pairs):
             advice = "; for further iterations after the last call result.more(scene, iterations)"
-    elif (before.__module__, before.__qualname__) == (now.__module__, now.__qualname__):  # A notebook's cell ran twice.
-        differing = f"the class {now.__name__} as it was before it was defined again"
-        advice = f", or with load_checkpoint(path, {now.__name__}) of what save_checkpoint wrote, for the new class"
+    elif (trained.__module__, trained.__qualname__) == (given.__module__, given.__qualname__):
+        # A cell of a notebook has run twice.
+        differing = f"the class {given.__name__} as it was before it was defined again"
+        advice = f", or with load_checkpoint(path, {given.__name__}) of what save_checkpoint wrote, for the new class"
     else:
-        differing = f"{before.__name__}, not {now.__name__}"
+        differing = f"{trained.__name__}, not {given.__name__}"
     raise ValueError(
         f"the checkpoint was made with another configuration ({shortened(differing, LONGEST_DIFFERENCE)}): resume with "
         f"checkpoint.system{advice}"

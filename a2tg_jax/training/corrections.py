@@ -159,16 +159,16 @@ def initial_corrections(
     states = []
     for correction in corrections:
         neutral = correction.neutral
-        known = {}
+        row_of = {}
         if origin is not None and correction.name in origin.corrections:
-            known = dict(zip(origin.names, origin.corrections[correction.name], strict=True))
+            row_of = dict(zip(origin.names, origin.corrections[correction.name], strict=True))
         # By name, because the earlier training may have had other views.
-        found = [known.get(name, neutral) for name in names]
-        for row in found:
+        initial = [row_of.get(name, neutral) for name in names]
+        for row in initial:
             if row.shape != neutral.shape:
                 shapes = f"{list(neutral.shape)}, as {type(correction).__name__} has them; got {list(row.shape)}"
                 raise ValueError(f"corrections called {correction.name!r} of the model to start from must be {shapes}")
-        rows = jnp.asarray(np.stack(found), dtype)
+        rows = jnp.asarray(np.stack(initial), dtype)
         # Counted per view, so that the bias correction fits each view's own steps.
         moments = dataclasses.replace(adam_init(rows), count=jnp.zeros(len(rows), jnp.int32))
         states.append(CorrectionState(rows, moments))
@@ -192,9 +192,9 @@ def corrected_camera(corrections: Sequence[Correction], rows: Sequence[Array], c
       ValueError: naming the correction, if it returns something else than a camera of the same size.
     """
     for correction, row in zip(corrections, rows, strict=True):
-        before = camera
-        camera = correction.camera(row, camera)
-        check_kept(f"{type(correction).__name__}.camera", camera, before)
+        corrected = correction.camera(row, camera)
+        check_kept(f"{type(correction).__name__}.camera", corrected, camera)
+        camera = corrected
     return camera
 
 
@@ -205,9 +205,9 @@ def corrected_color(corrections: Sequence[Correction], rows: Sequence[Array], co
       ValueError: naming the correction, if it returns something else than colours of the same shape.
     """
     for correction, row in zip(corrections, rows, strict=True):
-        before = color
-        color = correction.color(row, color)
-        check_kept(f"{type(correction).__name__}.color", color, before)
+        corrected = correction.color(row, color)
+        check_kept(f"{type(correction).__name__}.color", corrected, color)
+        color = corrected
     return color
 
 
@@ -217,20 +217,20 @@ def penalties(corrections: Sequence[Correction], rows: Sequence[Array]) -> list[
     Raises:
       ValueError: naming the correction, if it returns something else than a number.
     """
-    found = []
+    summands = []
     for correction, row in zip(corrections, rows, strict=True):
         penalty = correction.penalty(row)
         if penalty is not None:
             check_scalar(f"{type(correction).__name__}.penalty", penalty)
-            found.append(penalty)
-    return found
+            summands.append(penalty)
+    return summands
 
 
 def updated(
     correction: Correction, state: CorrectionState, views: Array, grads: Array, progress: Array
 ) -> CorrectionState:
-    """Return the state after a step of Adam on the rows of the views [B] that were seen, of which one may occur twice;
-    the gradients [B, ...] are of each view's own loss by its row."""
+    """Return the state after a step of Adam on the rows of the views [B] of a batch, in which a view may occur twice.
+    The gradients [B, ...] are those of each view's loss in its row."""
     # A view that occurs twice gets the sum of its gradients.
     sums = jnp.zeros_like(state.rows).at[views].add(grads)
     is_seen = jnp.zeros(len(state.rows), bool).at[views].set(True)
@@ -255,10 +255,11 @@ def corrected_origin(origin: Origin, corrections: Sequence[Correction], states: 
         return origin
     rows = {}
     for correction, state in zip(corrections, states, strict=True):
-        own = np.asarray(state.rows)
+        learned_rows = np.asarray(state.rows)
         # Nothing is learned for test views.
-        of_test_views = np.broadcast_to(correction.neutral, (len(origin.names) - len(own), *own.shape[1:]))
-        rows[correction.name] = np.concatenate([own, of_test_views.astype(own.dtype)])
+        num_test = len(origin.names) - len(learned_rows)
+        of_test_views = np.broadcast_to(correction.neutral, (num_test, *learned_rows.shape[1:]))
+        rows[correction.name] = np.concatenate([learned_rows, of_test_views.astype(learned_rows.dtype)])
     viewmats = origin.viewmats.copy()
     for index in np.flatnonzero(~origin.is_test):
         of_view = [jnp.asarray(rows[correction.name][index]) for correction in corrections]
@@ -271,9 +272,12 @@ def learned(origin: Origin) -> Mapping[str, Mapping[str, list[float]]]:
 
     Rows of more than `MOST_READABLE` numbers are left out.
     """
-    known = {name: rows for name, rows in origin.corrections.items() if rows[0].size <= MOST_READABLE}
-    training = [(index, name) for index, name in enumerate(origin.names) if not origin.is_test[index]]
-    return {name: {correction: rows[index].tolist() for correction, rows in known.items()} for index, name in training}
+    readable = {name: rows for name, rows in origin.corrections.items() if rows[0].size <= MOST_READABLE}
+    by_photograph = {}
+    for index, name in enumerate(origin.names):
+        if not origin.is_test[index]:
+            by_photograph[name] = {correction: rows[index].tolist() for correction, rows in readable.items()}
+    return by_photograph
 
 
 LUMINANCE = (0.299, 0.587, 0.114)

@@ -113,19 +113,18 @@ def forecast_stages(
     stages = stages[first:]
     floats = 0.0
     shared = 0
-    shown = None
+    appearance = None
     if num_given is not None:
         num = num_given
         stages = stages[1:]
         yield StageForecast(Bytes(), system.initial_bytes * num, num, num_programs=0, seconds=0, whole_bytes=0)
     for stage in stages:
         num = rows_needed(stage, num, system)
-        if stage.appearance != shown:
+        if stage.appearance != appearance:
             floats = stage.floats_shown(system.initial_sh_degree)
-            shown = stage.appearance
+            appearance = stage.appearance
             shared = stage.shared_bytes
-        own = floats_per_gaussian(system.initial_sh_degree) + floats
-        model_bytes = BYTES_PER_FLOAT * own * num + shared
+        model_bytes = BYTES_PER_FLOAT * (floats_per_gaussian(system.initial_sh_degree) + floats) * num + shared
         for event in stage.events:
             model_bytes = event.most_bytes(model_bytes, num, stage.iterations)
         floats = (model_bytes - shared) / BYTES_PER_FLOAT / num - floats_per_gaussian(system.initial_sh_degree)
@@ -156,21 +155,21 @@ def check_rows_fit(
     limit = allowed_memory(max_memory, devices.each)
     copies = STATES + 1
     forecasts = forecast_stages(scene, system, first=first, num_start=num_start)
-    for stage, found in zip(system.all_stages()[first:], forecasts, strict=True):
-        needed = copies * found.model_bytes
+    for stage, forecast in zip(system.all_stages()[first:], forecasts, strict=True):
+        needed = copies * forecast.model_bytes
         if needed <= limit:
             continue
         names = " or ".join(system.limits())
         if system.memory_budget is not None:
             names += f" of {system.memory_budget:,.15g} MB"
-        elif num_start is not None and found.num_rows == num_start:
+        elif num_start is not None and forecast.num_rows == num_start:
             names = "start"
         place = "this machine (its container and ulimit included)" if default_platform() == "cpu" else "the GPU"
         raise ValueError(
-            f"{names} is too large for {place}: stage {stage.name!r} trains up to {found.num_rows:,} Gaussians of "
-            f"{found.model_bytes / found.num_rows:,.0f} bytes, and {copies} copies of them (parameters, gradients and "
-            f"two moments) take at least {in_bytes(needed)} of memory, but {in_bytes(limit)} may be used: lower it, to "
-            f"a model of less than {in_bytes(limit / copies)}, or allow more with max_memory"
+            f"{names} is too large for {place}: stage {stage.name!r} trains up to {forecast.num_rows:,} Gaussians of "
+            f"{forecast.model_bytes / forecast.num_rows:,.0f} bytes, and {copies} copies of them (parameters, "
+            f"gradients and two moments) take at least {in_bytes(needed)} of memory, but {in_bytes(limit)} may be "
+            f"used: lower it, to a model of less than {in_bytes(limit / copies)}, or allow more with max_memory"
         )
 
 

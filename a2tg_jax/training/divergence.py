@@ -9,9 +9,8 @@ from a2tg_jax.training.checkpoint import Checkpoint, History
 from a2tg_jax.training.step import Attempt
 
 EXPLOSION = 100.0
-"""A loss that exceeds the stage's first logged loss by this factor is an explosion, …"""
+"""A loss is an explosion if it exceeds the stage's first logged loss by this factor, and `SMALL_LOSS`."""
 SMALL_LOSS = 10.0
-"""… unless it is no larger than this."""
 NAMED_ROWS = 5
 
 
@@ -33,16 +32,16 @@ def what_diverged(tried: Attempt, names: Sequence[str]) -> str:
     """Return the views and parameters whose numbers are not finite, or the loss if all of them are finite, given the
     step that could not be taken, in NumPy arrays, and the names of its views."""
     losses = np.asarray(tried.views.loss)
-    found = [f"the loss of {name} is {loss}" for name, loss in zip(names, losses, strict=True) if not np.isfinite(loss)]
-    found += [f"the gradient by {place}" for place in _not_finite(tried.grads)]
+    lost = [f"the loss of {name} is {loss}" for name, loss in zip(names, losses, strict=True) if not np.isfinite(loss)]
+    lost += [f"the gradient by {place}" for place in _not_finite(tried.grads)]
     model = tried.state.model
-    corrections = tuple(known.rows for known in tried.state.corrections)
-    found += [f"after the step, {place}" for place in _not_finite((model.gaussians, model.appearance, corrections))]
-    return "; ".join(found) or f"the loss of {', '.join(names)} is {np.mean(losses):.4g}"
+    corrections = tuple(correction.rows for correction in tried.state.corrections)
+    lost += [f"after the step, {place}" for place in _not_finite((model.gaussians, model.appearance, corrections))]
+    return "; ".join(lost) or f"the loss of {', '.join(names)} is {np.mean(losses):.4g}"
 
 
 def _not_finite(parameters: tuple[object, ...]) -> Iterator[str]:
-    """Yield each leaf of (gaussians, appearance, corrections) with such numbers, and their rows."""
+    """Yield in words each leaf of (gaussians, appearance, corrections) with numbers that are not finite."""
     for prefix, part in zip(("", "appearance", "corrections"), parameters, strict=True):
         for path, leaf in jax.tree_util.tree_flatten_with_path(part)[0]:
             numbers = np.atleast_1d(leaf)

@@ -1,6 +1,7 @@
 """Training from photographs: the stages of a system, each from the result of the one before."""
 
 import dataclasses
+import functools
 import os
 import warnings
 from typing import Any
@@ -95,10 +96,7 @@ class FitResult(NamedFields):
     @property
     def history(self) -> History:
         """History of all stages."""
-        first, *others = (stage.history for stage in self.stages)
-        for other in others:
-            first = first.followed_by(other)
-        return first
+        return functools.reduce(History.followed_by, (stage.history for stage in self.stages))
 
     @property
     def seconds(self) -> float:
@@ -220,14 +218,14 @@ def _check_arguments(
         example = f"use {path}_scene()" if path in BUILT_IN else f"use load_scene({path!r})"
     check_kind("scene", scene, Scene, example)
     if not isinstance(system, System):
-        found = kind_of(system)
+        kind = kind_of(system)
         example = ""
         if isinstance(system, str):
-            found = "a name"
+            kind = "a name"
             example = f": use find_system({shortened(system)!r}).preset('quick')"
         elif isinstance(system, type) and issubclass(system, System):
             example = f": use {system.__name__}() or {system.__name__}.preset('quick')"
-        raise ValueError(f"system must be a System; got {found}{example}")
+        raise ValueError(f"system must be a System; got {kind}{example}")
     if resume is not None:
         check_kind("resume", resume, Checkpoint, "use load_checkpoint(path)" if isinstance(resume, is_path) else "")
     if start is not None:
@@ -239,7 +237,7 @@ def _check_arguments(
             StageResult: "use result.model",
             Checkpoint: "give it as resume",
         }
-        hint = next((text for kind, text in hints.items() if isinstance(start, kind)), "")
+        hint = next((text for cls, text in hints.items() if isinstance(start, cls)), "")
         check_kind("start", start, Model, hint)
     if checkpoint_every is not None and checkpoint_every < 1:
         raise ValueError(f"checkpoint_every must be at least 1; got {checkpoint_every}")
@@ -331,13 +329,13 @@ def warn_of_budget(system: System, model: Model) -> None:
     """Warn if a finished model does not fill its memory budget or exceeds it."""
     budget = system.budget_bytes
     used = model.num_bytes
-    one = (used - model.bytes_of(0)) / model.num
+    bytes_each = (used - model.bytes_of(0)) / model.num
     if budget is None or budget * (1 - LARGEST_SHORTFALL) <= used <= budget:
         return
     if used > budget:
         advice = f"compose the stages of {type(system).__name__} with System.budget_cap"
-    elif used + one > budget:
-        advice = f"there is no room for another Gaussian of {one:,.0f} bytes: raise memory_budget"
+    elif used + bytes_each > budget:
+        advice = f"there is no room for another Gaussian of {bytes_each:,.0f} bytes: raise memory_budget"
     else:
         advice = f"raise {system.more_growth()}"
     share = f"{used / budget:.1%} of the memory_budget of {budget:,}"

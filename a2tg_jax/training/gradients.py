@@ -59,7 +59,7 @@ def view_gradients(
 
     Average the statistic over views with `GradientStatistics`:
 
-        statistics = statistics.observe(found.norms, found.is_visible)
+        statistics = statistics.observe(gradients.norms, gradients.is_visible)
 
     Args:
       loss: of the model, for regularisers, and of the view; a scalar.
@@ -82,8 +82,8 @@ def view_gradients(
     Examples:
       >>> photograph = jnp.asarray(a2tg.view_image(scene.test[0]))
       >>> loss = lambda model, output: a2tg.photometric_loss(output.color, photograph)
-      >>> found = a2tg.view_gradients(loss, model, camera)
-      >>> found.gradient.gaussians.means.shape, found.norms.shape
+      >>> gradients = a2tg.view_gradients(loss, model, camera)
+      >>> gradients.gradient.gaussians.means.shape, gradients.norms.shape
       ((200, 3), (200,))
     """
     check_literal("statistic", statistic, Statistic)
@@ -95,17 +95,17 @@ def view_gradients(
     background = background_array(background, model.gaussians)
     settings = with_capacity(settings, model.gaussians, camera, model.appearance, model.num_live)
 
-    def of_view(shown: Model, view: TracedView, output: RenderOutput) -> tuple[Array, RenderOutput]:
-        return loss(shown, output), output
+    def of_view(model: Model, view: TracedView, output: RenderOutput) -> tuple[Array, RenderOutput]:
+        return loss(model, output), output
 
-    found = differentiate(
+    result = differentiate(
         of_view, model, TracedView(camera, background), settings,
         has_geometry=has_geometry, sh_degree=sh_degree, statistic=statistic, has_probe=True,
     )  # fmt: skip
-    statistics, is_visible = read_probe(found.probe, statistic, camera.width, camera.height)
+    statistics, is_visible = read_probe(result.probe, statistic, camera.width, camera.height)
     floats, _ = partition(model)
-    gradient = dataclasses.replace(floats, gaussians=found.gaussians, appearance=found.appearance)
-    return ViewGradients(found.value, gradient, safe_norm(statistics), is_visible, found.auxiliary, found.num_pairs)
+    gradient = dataclasses.replace(floats, gaussians=result.gaussians, appearance=result.appearance)
+    return ViewGradients(result.value, gradient, safe_norm(statistics), is_visible, result.auxiliary, result.num_pairs)
 
 
 def value_and_grad(loss: Callable[..., Any], *, has_aux: bool = False) -> Callable[..., tuple[Any, Any]]:
@@ -205,13 +205,14 @@ def differentiate(
     def of_floats(
         gaussians: Gaussians, floats: Appearance, rows: tuple[Array, ...], probe: Array | None, view: TracedView
     ) -> tuple[Array, tuple[Any, Array]]:
-        seen = view._replace(rows=rows, camera=corrected_camera(view.corrections, rows, view.camera))
-        shown = dataclasses.replace(model, gaussians=gaussians, appearance=combine(floats, rest))
+        corrected = view._replace(rows=rows, camera=corrected_camera(view.corrections, rows, view.camera))
+        appearance = combine(floats, rest)
         output, num_pairs = render_traced(
-            gaussians, seen.camera, shown.appearance, view.background, settings,
+            gaussians, corrected.camera, appearance, view.background, settings,
             has_geometry=has_geometry, sh_degree=sh_degree, num_live=model.num_live, probe=probe, statistic=statistic,
         )  # fmt: skip
-        value, auxiliary = loss(shown, seen, output)
+        rendered = dataclasses.replace(model, gaussians=gaussians, appearance=appearance)
+        value, auxiliary = loss(rendered, corrected, output)
         return value, (auxiliary, num_pairs)
 
     # Adds nothing to the render; the gradient at it is the statistic.

@@ -128,13 +128,13 @@ class Session:
 
         Capacities are kept by place, a stage and an image size.
         """
-        known = self.capacities.setdefault(place, set())
+        capacities = self.capacities.setdefault(place, set())
         # Few different capacities, at most half as large again as needed.
         power = 2 ** (needed.bit_length() - 1)
         rounded = next(room for room in (power, power + power // 2, 2 * power) if room >= needed)
-        # The largest: lists that overflowed in an earlier run will do so again.
-        capacity = max((room for room in known if needed <= room <= 2 * needed), default=rounded)
-        known.add(capacity)
+        # The largest, because lists that overflowed in an earlier run would overflow again.
+        capacity = max((room for room in capacities if needed <= room <= 2 * needed), default=rounded)
+        capacities.add(capacity)
         return capacity
 
 
@@ -169,11 +169,11 @@ class StageRun:
         self._recorded_views = RecordedViews.of(scene.train)
         stages = system.all_stages()
         self.stage = stages[index]
-        own = resume if resume is not None and resume.stage == index else None
+        resumed = resume if resume is not None and resume.stage == index else None
         if num_restored is None:
-            num_restored = own.num_restored if own else 0
+            num_restored = resumed.num_restored if resumed else 0
         self.num_restored = num_restored
-        self._earlier = own.history if own else History.empty()
+        self._earlier = resumed.history if resumed else History.empty()
         self._rows: list[dict[str, float]] = []
         """Rows of the history since then."""
 
@@ -198,7 +198,7 @@ class StageRun:
                     stacklevel=2,
                 )
             state = copied(resume.state)
-            if own is None:
+            if resumed is None:
                 state = continued_state(stages[index - 1], self.stage, state)
         self.state = divided(self.mesh, self._with_room(state))
 
@@ -219,7 +219,7 @@ class StageRun:
         self.time_left: datetime.timedelta | None = None
         """Remaining time of the run, about; None at the beginning."""
         self.num_regrown = self.num_compiled = 0
-        self.num_refused = own.num_refused if own else 0
+        self.num_refused = resumed.num_refused if resumed else 0
 
     def _with_room(self, state: TrainState) -> TrainState:
         """Return the state, padded for what events will add between steps, so that no step is compiled again."""
@@ -227,13 +227,13 @@ class StageRun:
         moments = state.moments
         num = model.num
         num_bytes = float(model.num_bytes)
-        for event, own in zip(self.stage.events, state.events, strict=True):
-            if isinstance(event, HostEvent) and own is not None:
+        for event, event_state in zip(self.stage.events, state.events, strict=True):
+            if isinstance(event, HostEvent) and event_state is not None:
                 with calling(event, "with_room", self.stage.name):
-                    found = Change(*event.with_room(model, moments, num_bytes, self.stage.iterations), own)
-                    found = checked_change(found)
-                model = found.model
-                moments = found.moments
+                    padding = Change(*event.with_room(model, moments, num_bytes, self.stage.iterations), event_state)
+                    padding = checked_change(padding)
+                model = padding.model
+                moments = padding.moments
             num_bytes = event.most_bytes(num_bytes, num, self.stage.iterations)
         return dataclasses.replace(state, model=model, moments=moments)
 
@@ -284,11 +284,11 @@ class StageRun:
         # Several processes launch the same steps, and stop together.
         stops_launching = is_stopped if num_processes(self.mesh) == 1 else never
         most = max((event.most_gaussians or 0 for event in self.stage.events), default=0)
-        shown = title or self.stage.name
-        bar = ProgressBar(shown, iteration, end, is_shown=progress, most_gaussians=most, after=after)
+        title = title or self.stage.name
+        bar = ProgressBar(title, iteration, end, is_shown=progress, most_gaussians=most, after=after)
         with contextlib.closing(self.photographs), bar:
             while iteration < end:
-                # Python acts next after `launched` steps, an event, or a checkpoint.
+                # Python acts after `launched` steps, and at events and checkpoints.
                 stops = [iteration + self.launched - iteration % self.launched, end]
                 stops += [due for due in self._due_on_host() if due > iteration]
                 if checkpoint_every is not None:
@@ -302,7 +302,7 @@ class StageRun:
                     bar.update(info, self._rows[-1] if self._rows else None)
                 ahead = self.effects.programs_ahead(iteration)
                 self.time_left = bar.tell_pace(iteration, self.num_compiled, ahead, self.effects.seconds_a_program)
-                # Not where a step could not be taken, or training is being stopped.
+                # `iteration` is less if a step could not be taken or training is being stopped.
                 if iteration == stop:
                     self._host_events(iteration)
                 self.started += watch(self, is_stopped)
@@ -354,11 +354,11 @@ class StageRun:
     def _launch(self, iteration: int) -> StepInfo:
         arguments = self.arguments(iteration)
         step = jitted_step()
-        before = num_compiled(step)
+        num_programs = num_compiled(step)
         started = time.perf_counter()
         info: StepInfo
         self.state, info = step(*arguments)
-        is_compiled = num_compiled(step) > before
+        is_compiled = num_compiled(step) > num_programs
         self.effects.launch(iteration, time.perf_counter() - started if is_compiled else None)
         if is_compiled:
             self.num_compiled += 1
@@ -405,7 +405,7 @@ class StageRun:
 
     def _mend(self, iteration: int, info: StepInfo) -> None:
         """Make more room for the tile lists; raise an error for every other cause."""
-        # Any other status would keep all further steps idle.
+        # With its present status all further steps would stay idle.
         self.state = dataclasses.replace(self.state, status=jnp.zeros_like(self.state.status))
         if info.status == OVERFLOW:
             self.num_regrown += 1
@@ -444,7 +444,7 @@ class StageRun:
         return due
 
     def _is_worth_dropping(self, iteration: int) -> bool:
-        """Return whether statistics that nothing reads after an iteration are dropped, for which a step is compiled."""
+        """Return whether enough iterations are left to compile a step without the statistics that nothing reads."""
         return self.stage.iterations - iteration >= WORTH_COMPILING
 
     def _host_events(self, iteration: int) -> None:
@@ -462,9 +462,11 @@ class StageRun:
             if iteration not in due:
                 continue
             background = BACKGROUNDS[self.system.background]
-            now = Due(due.index(iteration) + 1, len(due), self.views, background=background, shapes=self.session.shapes)
+            time_due = Due(
+                due.index(iteration) + 1, len(due), self.views, background=background, shapes=self.session.shapes
+            )
             with calling(event, "apply", self.stage.name):
-                change = event.apply(now, self.state.model, self.state.moments, self.state.events[place])
+                change = event.apply(time_due, self.state.model, self.state.moments, self.state.events[place])
                 change = checked_change(change)
             self.effects.apply(place, self.state, change)
             self.state = dataclasses.replace(self.state, model=change.model, moments=change.moments)

@@ -224,16 +224,18 @@ class System(NamedFields):
         Args:
           stage: index of the stage, from 0; later stages keep the rates of the first one's end.
         """
-        found: list[Exposure | BilateralGrid | PoseRefinement] = []
+        chosen: list[Exposure | BilateralGrid | PoseRefinement] = []
         if self.refine_poses:
-            found.append(self.corrections.pose)
+            chosen.append(self.corrections.pose)
         if self.exposure:
-            found.append(self.corrections.affine)
+            chosen.append(self.corrections.affine)
         if self.exposure and self.corrections.exposure_kind == "grid":
-            found.append(self.corrections.grid)
+            chosen.append(self.corrections.grid)
         if stage:
-            found = [dataclasses.replace(one, rate=one.rate * one.final_factor, final_factor=1.0) for one in found]
-        return tuple(found)
+            chosen = [
+                dataclasses.replace(part, rate=part.rate * part.final_factor, final_factor=1.0) for part in chosen
+            ]
+        return tuple(chosen)
 
     def stages(self) -> tuple[Stage, ...]:
         """Return the stages, in the order of training.
@@ -246,14 +248,14 @@ class System(NamedFields):
     def all_stages(self) -> tuple[Stage, ...]:
         """Return the stages, and the further ones of `more`, in which the last one continues.
 
-        Of the last stage's events, these keep the ones of every iteration, such as noise: the others have happened.
+        They keep the last stage's events of every iteration, such as noise; the others have happened.
         """
         stages = self.stages()
         if not self.more:
             return stages
         last = stages[-1]
-        kept = tuple(last.events[index] for index in last.lasting())
-        further = dataclasses.replace(last, events=kept, raises_sh_degree=False, continues=True)
+        events = tuple(last.events[index] for index in last.lasting())
+        further = dataclasses.replace(last, events=events, raises_sh_degree=False, continues=True)
         names = ["more", *(f"more-{number}" for number in range(2, len(self.more) + 1))]
         pairs = zip(names, self.more, strict=True)
         return (*stages, *(dataclasses.replace(further, name=name, iterations=length) for name, length in pairs))
@@ -303,8 +305,8 @@ class System(NamedFields):
         check_config(self)
         for name, value in flatten_config(self).items():
             # Types were checked; infinity and NaN are floats too.
-            held = value if isinstance(value, tuple) else (value,)
-            if not all(math.isfinite(number) for number in held if isinstance(number, float)):
+            values = value if isinstance(value, tuple) else (value,)
+            if not all(math.isfinite(number) for number in values if isinstance(number, float)):
                 wanted = "finite numbers" if isinstance(value, tuple) else "a finite number"
                 raise ValueError(f"{name} must be {wanted}; got {shortened(value)}")
         for field in dataclasses.fields(self):
@@ -355,8 +357,8 @@ class System(NamedFields):
         """Return the path of the option that an event of a stage was made from, such as "densify"; the name of the
         event's class if there is none."""
         groups = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        found = [name for name, group in groups.items() if isinstance(group, Event) and isinstance(event, type(group))]
-        return next(iter(found), type(event).__name__)
+        names = (name for name, group in groups.items() if isinstance(group, Event) and isinstance(event, type(group)))
+        return next(names, type(event).__name__)
 
     def more_growth(self) -> str:
         """Return the names of the options to raise for more Gaussians, for advice."""
@@ -367,12 +369,14 @@ class System(NamedFields):
         """Return the paths of the options that limit the number of Gaussians without a memory budget."""
         events = [event for stage in self.stages() for event in stage.events if event.limited_by]
         paths = dict.fromkeys(f"{self.path_of(event)}.{event.limited_by}" for event in events)
-        # An event that is no option has no path, but its class's name.
+        # The path of an event that is no option is its class's name, which is no option either.
         return tuple(path for path in paths if path in flatten_config(self))
 
     def limits(self) -> tuple[str, ...]:
         """Return the paths of the options that limit the number of Gaussians, for advice."""
-        return ("memory_budget",) if self.memory_budget is not None else self.caps() or ("initial_gaussians",)
+        if self.memory_budget is not None:
+            return ("memory_budget",)
+        return self.caps() or ("initial_gaussians",)
 
     def check_number(self, num: int) -> None:
         """Check the options for a number of Gaussians at the start.
@@ -418,31 +422,33 @@ def like(kind: Any, other: object) -> Any:
     Returns:
       The system or group of class `kind`.
     """
-    value = kind() if isinstance(kind, type) else kind
-    hints, other_hints = (typing.get_type_hints(type(config)) for config in (value, other))
+    config = kind() if isinstance(kind, type) else kind
+    hints = typing.get_type_hints(type(config))
+    other_hints = typing.get_type_hints(type(other))
     changes = {}
-    for field in dataclasses.fields(value):
-        own = getattr(value, field.name)
-        others = getattr(other, field.name, None)
-        if dataclasses.is_dataclass(own) and dataclasses.is_dataclass(others):
-            changes[field.name] = like(own, others)
+    for field in dataclasses.fields(config):
+        option = getattr(config, field.name)
+        other_option = getattr(other, field.name, None)
+        if dataclasses.is_dataclass(option) and dataclasses.is_dataclass(other_option):
+            changes[field.name] = like(option, other_option)
         # The same name with another type means something else.
         elif hints[field.name] == other_hints.get(field.name):
-            changes[field.name] = others
-    return dataclasses.replace(value, **changes)
+            changes[field.name] = other_option
+    return dataclasses.replace(config, **changes)
 
 
 def own_options(system: object, other: object) -> dict[str, Any]:
     """Return the options of a system, or of a group of options, that another lacks or has otherwise, nested as in a
     configuration file."""
-    hints, other_hints = (typing.get_type_hints(type(config)) for config in (system, other))
-    found: dict[str, Any] = {}
-    for name, option in config_to_dict(system).items():
-        own = getattr(system, name)
-        others = getattr(other, name, None)
-        if dataclasses.is_dataclass(own) and dataclasses.is_dataclass(others):
-            inner = own_options(own, others)
-            found |= {name: inner} if inner else {}
-        elif hints[name] != other_hints.get(name) or own != others:
-            found[name] = option
-    return found
+    hints = typing.get_type_hints(type(system))
+    other_hints = typing.get_type_hints(type(other))
+    differing: dict[str, Any] = {}
+    for name, value in config_to_dict(system).items():
+        option = getattr(system, name)
+        other_option = getattr(other, name, None)
+        if dataclasses.is_dataclass(option) and dataclasses.is_dataclass(other_option):
+            inner = own_options(option, other_option)
+            differing |= {name: inner} if inner else {}
+        elif hints[name] != other_hints.get(name) or option != other_option:
+            differing[name] = value
+    return differing

@@ -65,17 +65,18 @@ class RecordedViews:
 
     def check(self, views: Sequence[View]) -> None:
         """Raise ValueError if a training is resumed with other views, sizes or cameras; warn of other pixels."""
-        given = RecordedViews.of(views)
+        present = RecordedViews.of(views)
         advice = "resume with the scene that it was made from, or give its model to fit as start"
-        check_names(self.names, given.names, "the checkpoint", advice)
-        differ = (self.sizes != given.sizes).any(axis=1)
-        for own, other in ((self.viewmats, given.viewmats), (self.Ks, given.Ks)):
-            is_close = np.isclose(own, other, rtol=CAMERA_TOLERANCE, atol=CAMERA_TOLERANCE)
+        check_names(self.names, present.names, "the checkpoint", advice)
+        differ = (self.sizes != present.sizes).any(axis=1)
+        for field in ("viewmats", "Ks"):
+            recorded = getattr(self, field)
+            is_close = np.isclose(recorded, getattr(present, field), rtol=CAMERA_TOLERANCE, atol=CAMERA_TOLERANCE)
             differ |= ~is_close.all(axis=(1, 2))
         if differ.any():
             raise ValueError(f"the checkpoint was trained with other cameras of {self._named(differ)}: {advice}")
-        is_known = (self.pixels != UNKNOWN) & (given.pixels != UNKNOWN)
-        changed = (is_known & (self.pixels != given.pixels)) | (self.masks != given.masks)
+        is_known = (self.pixels != UNKNOWN) & (present.pixels != UNKNOWN)
+        changed = (is_known & (self.pixels != present.pixels)) | (self.masks != present.masks)
         if changed.any():
             warnings.warn(
                 f"photographs or masks have changed since the checkpoint was made: {self._named(changed)}; what was "
@@ -87,14 +88,16 @@ class RecordedViews:
         return first_names([self.names[index] for index in np.flatnonzero(chosen)])
 
 
-def check_names(known: Sequence[str], given: Sequence[str], what: str, advice: str) -> None:
+def check_names(recorded: Sequence[str], present: Sequence[str], what: str, advice: str) -> None:
     """Raise ValueError, naming the views that are missing or new, unless training has the same views as before."""
-    if list(known) == list(given):
+    if list(recorded) == list(present):
         return
-    lost = [name for name in known if name not in given]
-    new = [name for name in given if name not in known]
-    parts = [f"{first_names(found)} {verb}" for found, verb in ((lost, "missing"), (new, "new")) if found]
+    missing = [name for name in recorded if name not in present]
+    new = [name for name in present if name not in recorded]
+    parts = [f"{first_names(missing)} missing"] if missing else []
+    parts += [f"{first_names(new)} new"] if new else []
     difference = ", ".join(parts) or "their order differs"
     raise ValueError(
-        f"{what} was trained on {len(known)} views, and the scene has {len(given)} to train on: {difference}; {advice}"
+        f"{what} was trained on {len(recorded)} views, and the scene has {len(present)} to train on: {difference}; "
+        f"{advice}"
     )

@@ -46,7 +46,7 @@ def find_system(reference: str) -> System:
             f"and your own as package.module:NAME{did_you_mean(reference, SYSTEMS)}"
         )
     try:
-        found = getattr(importlib.import_module(path), attribute)
+        system = getattr(importlib.import_module(path), attribute)
     except Exception as error:  # A custom module may fail in any way.
         kind = "" if isinstance(error, ImportError | AttributeError) else f"{type(error).__name__}: "
         near = did_you_mean(attribute, vars(sys.modules[path]) if path in sys.modules else {})
@@ -54,20 +54,20 @@ def find_system(reference: str) -> System:
         if isinstance(error, ModuleNotFoundError) and path.partition(".")[0] == str(error.name).partition(".")[0]:
             reason += ": install it, add its folder to PYTHONPATH, or start in that folder"
         raise ValueError(f"the system {name} cannot be imported: {reason}{near}") from error
-    if isinstance(found, type) and issubclass(found, System):
+    if isinstance(system, type) and issubclass(system, System):
         try:
-            return found()
+            return system()
         except TypeError as error:
             raise ValueError(f"every option of the system {name} must have a default: {error}") from error
-    if not isinstance(found, System):
+    if not isinstance(system, System):
         raise ValueError(f"{name} is no system: it must be a subclass or an instance of a2tg_jax.System")
-    return found
+    return system
 
 
 def reference_of(system: System) -> str:
     """Return the name with which `find_system` finds a system's class."""
     reference = f"{type(system).__module__}:{type(system).__qualname__}"
-    return next((name for name, own in SYSTEMS.items() if own == reference), reference)
+    return next((name for name, path in SYSTEMS.items() if path == reference), reference)
 
 
 def system_to_dict(system: System) -> dict[str, object]:

@@ -27,8 +27,10 @@ from a2tg_jax.training.stage import Background, Stage
 from a2tg_jax.training.step import StepInfo, TrainState
 
 MOMENTUM = 0.95
-TIMED_SECONDS, TIMED_STEPS = 2.0, 3
-"""Smallest number of timed steps before a forecast of the duration."""
+TIMED_SECONDS = 2.0
+"""Least time of the steps from which a duration is forecast."""
+TIMED_STEPS = 3
+"""Least number of these steps."""
 BAR = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]"
 """tqdm's format without its rate and remaining time, which count compilation."""
 
@@ -211,7 +213,8 @@ class LearningCheck:
         flat = []
         # Flat colours of the same views, because some are easier than others.
         for iteration, _ in self._seen:
-            for view in (self._views[index] for index in self._order.indices(iteration)):
+            for index in self._order.indices(iteration):
+                view = self._views[index]
                 mask = None if view.mask is None else view.mask.read()
                 flat.append(float(jax.jit(flat_psnr)(view_image(view, (self._level,) * 3), mask)))
         if not has_learned(reached, float(np.mean(flat))):
@@ -253,7 +256,7 @@ class Effects:
     has_changed: bool = False
     """Whether it has ever changed the model or the moments."""
     unused: str | None = None
-    """`Change.unused` if that was given each time."""
+    """Last `Change.unused`; None if the event made a difference at any time."""
 
 
 class StageEffects:
@@ -273,21 +276,22 @@ class StageEffects:
 
     def apply(self, place: int, state: TrainState, change: Change) -> None:
         """Record a change of the state by the event at an index."""
-        _, own = self._on_host[place]
-        before = state.model, state.moments, state.events[place]
-        after = change.model, change.moments, change.state
-        (leaves, structure), (new, new_structure) = jax.tree.flatten(before), jax.tree.flatten(after)
+        _, effects = self._on_host[place]
+        leaves, structure = jax.tree.flatten((state.model, state.moments, state.events[place]))
+        new, new_structure = jax.tree.flatten((change.model, change.moments, change.state))
         is_reshaped: bool = structure != new_structure  # type: ignore[operator]
         is_reshaped = is_reshaped or [jax.typeof(leaf) for leaf in leaves] != [jax.typeof(leaf) for leaf in new]
         if is_reshaped:
             self._reshaped_by.append(place)
         # Values are compared until the event has changed some once, which is nearly always the first time.
-        if not own.has_changed:
-            pairs = zip(*(jax.tree.leaves(tree[:2]) for tree in (before, after)), strict=True)
-            own.has_changed = is_reshaped or not all(a is b or np.array_equal(a, b) for a, b in pairs)
-        if own.num_applied == 0 or not change.unused:
-            own.unused = change.unused
-        own.num_applied += 1
+        if not effects.has_changed:
+            values = jax.tree.leaves((state.model, state.moments))
+            new_values = jax.tree.leaves((change.model, change.moments))
+            pairs = zip(values, new_values, strict=True)
+            effects.has_changed = is_reshaped or not all(a is b or np.array_equal(a, b) for a, b in pairs)
+        if effects.num_applied == 0 or not change.unused:
+            effects.unused = change.unused
+        effects.num_applied += 1
 
     def launch(self, iteration: int, seconds: float | None) -> None:
         """Record a step that was launched, and the seconds that its compilation took, if any. Warn if an event is why
@@ -296,12 +300,12 @@ class StageEffects:
         self._reshaped_by = []
         if seconds is None:
             return
-        self._num_compiled = self._num_compiled + 1
-        self._seconds = self._seconds + seconds
+        self._num_compiled += 1
+        self._seconds += seconds
         for place in dict.fromkeys(reshaped_by):
-            event, own = self._on_host[place]
-            own.num_compiled += 1
-            if own.num_compiled == MANY_PROGRAMS and type(event).with_room is HostEvent.with_room:
+            event, effects = self._on_host[place]
+            effects.num_compiled += 1
+            if effects.num_compiled == MANY_PROGRAMS and type(event).with_room is HostEvent.with_room:
                 left = len(self._ahead(event, iteration))
                 warnings.warn(
                     f"stage {self._stage.name!r}: {type(event).__name__} has changed shapes {MANY_PROGRAMS} times, and "
@@ -314,13 +318,13 @@ class StageEffects:
     def programs_ahead(self, iteration: int) -> int:
         """Return the number of programs that events will cause from an iteration on, about."""
         num = 0.0
-        for event, own in self._on_host.values():
-            if left := len(self._ahead(event, iteration)):
-                times = event.iterations(self._stage.iterations)
-                known = own.num_compiled, own.num_applied
-                # What it caused so far, or else its own forecast.
-                caused, among = known if own.num_applied else (event.num_programs(self._stage.iterations), len(times))
-                num += left * caused / among
+        length = self._stage.iterations
+        for event, effects in self._on_host.values():
+            left = len(self._ahead(event, iteration))
+            if left and effects.num_applied:  # As often as so far.
+                num += left * effects.num_compiled / effects.num_applied
+            elif left:
+                num += left * event.num_programs(length) / len(event.iterations(length))
         return round(num * self._num_sizes)
 
     @property
@@ -342,8 +346,8 @@ class StageEffects:
                 # The first multiple of `every` from `first` on.
                 first = max(1, -(-times.first // times.every)) * times.every if times.num_times else end
             else:
-                found: Any = event.iterations(end) if isinstance(event, HostEvent) else ()
-                first = next((time for time in found if time >= 1), found[-1] if found else end)
+                due: Any = event.iterations(end) if isinstance(event, HostEvent) else ()
+                first = next((time for time in due if time >= 1), due[-1] if due else end)
             if not 1 <= first <= end:
                 warnings.warn(
                     f"stage {self._stage.name!r}: {self._system.path_of(event)} never happens: it is first due at "
@@ -354,14 +358,15 @@ class StageEffects:
     def warn_of_unused(self) -> None:
         """Warn of events that happened at all their times and never made a difference."""
         unused = []
-        for event, own in self._on_host.values():
+        for event, effects in self._on_host.values():
             times = event.iterations(self._stage.iterations)
-            if not own.num_applied or own.num_applied < len(times):  # A resumed stage has not seen the first ones.
+            # In a resumed stage, the first times may have been before.
+            if not effects.num_applied or effects.num_applied < len(times):
                 continue
             name = self._system.path_of(event)
-            if not own.has_changed:
-                unused.append(f"{name} changed nothing, though it happened {own.num_applied:,} times")
-            elif own.unused:
-                unused.append(f"{name}.{own.unused}")
+            if not effects.has_changed:
+                unused.append(f"{name} changed nothing, though it happened {effects.num_applied:,} times")
+            elif effects.unused:
+                unused.append(f"{name}.{effects.unused}")
         if unused:
             warnings.warn(f"stage {self._stage.name!r}: {'; '.join(unused)}", stacklevel=2)

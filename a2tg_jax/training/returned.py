@@ -57,14 +57,16 @@ def checked_change(change: Any) -> Change:
     return change._replace(model=dataclasses.replace(change.model, num_live=change.model.live_count))
 
 
-def check_kept(name: str, found: object, wanted: object) -> None:
-    """Raise ValueError, naming the leaf, unless a pytree has the structure, shapes and dtypes of another."""
-    before, after = (str(jax.tree.structure(tree)) for tree in (wanted, found))
-    if after != before:
-        raise ValueError(f"{name} must keep its structure, {shortened(before)}; got {shortened(after)}")
+def check_kept(name: str, returned: object, given: object) -> None:
+    """Raise ValueError, naming the leaf, unless a returned pytree has the structure, shapes and dtypes of the one that
+    was given."""
+    structure = str(jax.tree.structure(returned))
+    expected = str(jax.tree.structure(given))
+    if structure != expected:
+        raise ValueError(f"{name} must keep its structure, {shortened(expected)}; got {shortened(structure)}")
 
     def shape_of(leaf: ArrayLike) -> jax.ShapeDtypeStruct:
-        # JAX's dtype of a number or an array, which is not copied.
+        # Without a copy of the array; a number has JAX's dtype of it.
         return jax.ShapeDtypeStruct(np.shape(leaf), jax.dtypes.canonicalize_dtype(dtype_of(leaf)))
 
-    check_like(name, jax.tree.map(shape_of, found), wanted)
+    check_like(name, jax.tree.map(shape_of, returned), given)

@@ -123,8 +123,7 @@ class Stage(NamedFields):
     @property
     def statistic(self) -> Statistic | None:
         """Gradient statistic that the events need, or None."""
-        wanted = {event.statistic for event in self.events} - {None}
-        return next(iter(wanted), None)
+        return next((event.statistic for event in self.events if event.statistic is not None), None)
 
     @property
     def has_geometry(self) -> bool:
@@ -144,14 +143,14 @@ class Stage(NamedFields):
     def floats_shown(self, sh_degree: int) -> float:
         """Return the floats of appearance that a Gaussian of a degree has when the stage begins (host)."""
         few = no_rows(64, NUM_BASES[sh_degree])
-        shown = allocate_appearance(self.appearance, jax.random.key(0), few)
-        return (count_floats(shown, few.num) - count_floats(shown, 0)) / few.num
+        appearance = allocate_appearance(self.appearance, jax.random.key(0), few)
+        return (count_floats(appearance, few.num) - count_floats(appearance, 0)) / few.num
 
     @property
     def shared_bytes(self) -> int:
         """Bytes of what the Gaussians share (host)."""
-        shown = allocate_appearance(self.appearance, jax.random.key(0), no_rows(2, 1))
-        return BYTES_PER_FLOAT * count_floats(shown, 0)
+        appearance = allocate_appearance(self.appearance, jax.random.key(0), no_rows(2, 1))
+        return BYTES_PER_FLOAT * count_floats(appearance, 0)
 
     def is_ahead(self, event: Event) -> bool:
         """Return whether an event happens at all (host)."""
@@ -194,11 +193,11 @@ class Stage(NamedFields):
                 check_number(f"{name}.times: every", times.every, least=1)
             elif isinstance(event, HostEvent):
                 with calling(event, "iterations", self.name):
-                    found = event.iterations(self.iterations)
-                is_integers = isinstance(found, Sequence) and all(isinstance(num, int | np.integer) for num in found)
-                if not is_integers or list(found) != sorted(set(found)):
+                    due = event.iterations(self.iterations)
+                is_integers = isinstance(due, Sequence) and all(isinstance(num, int | np.integer) for num in due)
+                if not is_integers or list(due) != sorted(set(due)):
                     raise ValueError(
-                        f"{name}.iterations must return ascending integers in a tuple; got {shortened(found)}"
+                        f"{name}.iterations must return ascending integers in a tuple; got {shortened(due)}"
                     )
         names = [correction.name for correction in self.corrections]
         if len(set(names)) < len(names):
@@ -268,7 +267,7 @@ class Stage(NamedFields):
             per_iteration=1.0 / self.iterations,
             log_decay=math.log(self.rates.means_final_factor),
             sh_interval=max(1, round(self.iterations / 30)),  # 1,000 of 30,000 iterations in 3DGS
-            # What is always due needs no condition in the step.
+            # An event of every iteration needs no condition in the step.
             times=tuple(None if times == EVERY_ITERATION else times for times in times),
         )
 

@@ -35,8 +35,10 @@ KEY_OF_APPEARANCE = 0x7E8E1  # no stage's number, which is folded into the same 
 LEAST_OPACITY = INITIAL_OPACITY
 """Lower bound of the reduced opacities: the initial opacity of 3DGS."""
 SMALLEST_SIDE = 1e-6
-GREY, GREY_SLACK = 0.5, 0.01
-"""Colour of points without one, and the difference up to which a colour counts as that grey."""
+GREY = 0.5
+"""Colour of points without one."""
+GREY_SLACK = 0.01
+"""Largest difference of a colour that counts as this grey."""
 
 
 def initial_model(scene: Scene, system: System) -> Model:
@@ -56,9 +58,9 @@ def start_colors(scene: Scene) -> np.ndarray:
     colors = np.asarray(scene.colors)
     if len(colors) < 2 or (colors != colors[0]).any() or (np.abs(colors[0] - GREY) < GREY_SLACK).all():
         return colors
-    given = ", ".join(f"{number:g}" for number in colors[0].round(3).tolist())
+    color = ", ".join(f"{number:g}" for number in colors[0].round(3).tolist())
     warnings.warn(
-        f"all {len(colors):,} points of {scene.name} have one colour ({given}): taken as points without colours, "
+        f"all {len(colors):,} points of {scene.name} have one colour ({color}): taken as points without colours, "
         "which start grey",
         stacklevel=3,
     )
@@ -68,8 +70,8 @@ def start_colors(scene: Scene) -> np.ndarray:
 def wider_where_dense(gaussians: Gaussians, cameras: Sequence[Camera]) -> Gaussians:
     """Widen Gaussians to a standard deviation of a pixel at least, from the camera where they are largest (host).
 
-    Without a low-pass filter smaller splats show only if they cover a pixel's centre, and then without neighbours that
-    they overlap. Gaussians that no camera sees stay.
+    Without a low-pass filter, a smaller splat shows only if it covers a pixel's centre, and hardly overlaps others.
+    Gaussians that no camera sees stay unchanged.
     """
     pixels = _largest_sizes(gaussians, cameras)
     growth = np.where(pixels > 0, np.maximum(1 / np.maximum(pixels, SMALLEST_SIDE), 1.0), 1.0)
@@ -196,9 +198,9 @@ def given_start(start: Model, scene: Scene, system: System, index: int) -> Model
             stacklevel=3,
         )
     _check_seen("start.gaussians.means", np.asarray(start.gaussians.means), scene)
-    shown = template_of(start.appearance)
-    # What the stage before ends with is meant to be replaced, such as textures by others.
-    is_expected = shown == stage.appearance or (index > 0 and shown == stages[index - 1].appearance)
+    template = template_of(start.appearance)
+    # The appearance of the stage before is expected as well: this stage replaces it, such as textures by others.
+    is_expected = template == stage.appearance or (index > 0 and template == stages[index - 1].appearance)
     if is_expected and start.gaussians.sh_degree == degree:
         return start
     if is_expected and start.appearance.coefficients is not None:
@@ -219,14 +221,14 @@ def given_start(start: Model, scene: Scene, system: System, index: int) -> Model
 
 
 def left_out(model: Model, degree: int, template: Appearance | None) -> list[str]:
-    """Return in words what is dropped of a model that gets spherical harmonics of a degree, and an appearance of the
-    template's options, in which only the shapes of kernels are kept; None: it keeps its own."""
-    shown = model.appearance
+    """Return in words what a model loses if its spherical harmonics get a degree, and its appearance the options of a
+    template, which keeps only the shapes of kernels. Template None: the appearance is kept."""
+    appearance = model.appearance
     lost = []
-    has_shapes = shown.exponents is not None
+    has_shapes = appearance.exponents is not None
     if has_shapes and template is not None and template.exponents is None:
         lost.append("the shapes of its kernels (the nearest Gaussians replace them)")
-    if template is not None and (not shown.is_portable or shown.texture is not None):
+    if template is not None and (not appearance.is_portable or appearance.texture is not None):
         lost.append("what its splats show besides " + ("kernels" if has_shapes else "Gaussians"))
     if model.sh[:, NUM_BASES[degree] :].any():
         lost.append(f"its spherical harmonics above degree {degree}")
@@ -241,9 +243,9 @@ def with_degree(gaussians: Gaussians, degree: int) -> Gaussians:
     return dataclasses.replace(gaussians, sh=jnp.asarray(sh))
 
 
-def _are_close(one: Similarity, other: Similarity) -> bool:
+def _are_close(similarity: Similarity, other: Similarity) -> bool:
     """Return whether two similarities are equal but for rounding."""
-    pairs = zip(dataclasses.astuple(one), dataclasses.astuple(other), strict=True)
+    pairs = zip(dataclasses.astuple(similarity), dataclasses.astuple(other), strict=True)
     return all(np.allclose(a, b, rtol=1e-6, atol=1e-6) for a, b in pairs)
 
 
@@ -274,8 +276,8 @@ def initial_number(scene: Scene, system: System, first: Stage) -> int:
     """Return the number of initial Gaussians: as requested, at most one for each point, and at most what the first
     stage has room for."""
     num = len(scene.points)
-    caps = [most for event in first.events if (most := event.most_gaussians) is not None]
-    return min([num, system.initial_gaussians or num, *caps])
+    caps = [event.most_gaussians for event in first.events]
+    return min([num, system.initial_gaussians or num, *(cap for cap in caps if cap is not None)])
 
 
 def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> Model:
@@ -320,8 +322,8 @@ def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> 
 def _kept_fields(before: Appearance, allocated: Appearance, stage: Stage) -> dict[str, Any]:
     """Return the parts and arrays of the appearance before a stage that fit the one that the stage allocates, by field.
 
-    Parts fit if their options are equal, arrays that both classes have if their shapes are, but for the number of rows.
-    Warns of other arrays.
+    A part fits if its options are equal. An array that both classes have fits if the shape of a row is equal; you are
+    warned of others.
     """
     is_related = isinstance(before, type(allocated)) or isinstance(allocated, type(before))
     is_same = template_of(before) == stage.appearance

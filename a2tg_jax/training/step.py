@@ -106,12 +106,12 @@ def initial_state(stage: Stage, model: Model, names: Sequence[str] = (), origin:
 def continued_state(before: Stage, stage: Stage, state: TrainState) -> TrainState:
     """Return the state before the first iteration of a stage that continues the one before, given that one's last
     state. Events that both stages hold continue as well."""
-    known = {id(event): own for event, own in zip(before.events, state.events, strict=True)}
+    state_of = {id(event): event_state for event, event_state in zip(before.events, state.events, strict=True)}
     events = []
     for event in stage.events:
-        own = known.get(id(event))
-        is_new = own is None and stage.is_ahead(event)
-        events.append(event.init(state.model) if is_new else own)
+        event_state = state_of.get(id(event))
+        is_new = event_state is None and stage.is_ahead(event)
+        events.append(event.init(state.model) if is_new else event_state)
     # Two arrays: the step takes over each buffer once.
     iteration = jnp.zeros((), jnp.int32)
     status = jnp.zeros((), jnp.int32)
@@ -171,21 +171,22 @@ def train_step(
       rows: [V] int32, their numbers among all training views; needed for corrections.
     """
     tried = attempt(settings, stage, clock, state, photographs, views, scene_scale, key, rows)
-    found = tried.views
+    drawn = tried.views
     # The last assignment wins: after an overflow all other numbers are meaningless.
     status = jnp.where(tried.info.is_possible, FINE, IMPOSSIBLE)
-    status = jnp.where(jnp.mean(found.loss) > clock.largest_loss, EXPLODED, status)
+    status = jnp.where(jnp.mean(drawn.loss) > clock.largest_loss, EXPLODED, status)
     status = jnp.where(tried.is_finite, status, NOT_FINITE)
-    status = jnp.where(jnp.any(found.is_overflow), OVERFLOW, status).astype(jnp.int32)
+    status = jnp.where(jnp.any(drawn.is_overflow), OVERFLOW, status).astype(jnp.int32)
     status = jnp.where(state.status == FINE, status, state.status)
     # Chosen inside the step, because it has taken over the old state's buffers.
-    new, old = (dataclasses.replace(known, status=status) for known in (tried.state, state))
-    chosen = jax.tree.map(lambda a, b: jnp.where(status == FINE, a, b), new, old)
+    taken = dataclasses.replace(tried.state, status=status)
+    kept = dataclasses.replace(state, status=status)
+    chosen = jax.tree.map(lambda new, old: jnp.where(status == FINE, new, old), taken, kept)
     chosen = with_rows_divided(settings.mesh, chosen)
     return chosen, StepInfo(
-        loss=jnp.mean(found.loss), psnr=jnp.mean(found.psnr), num_pairs=jnp.max(found.num_pairs), status=status,
+        loss=jnp.mean(drawn.loss), psnr=jnp.mean(drawn.psnr), num_pairs=jnp.max(drawn.num_pairs), status=status,
         num_live=chosen.model.num_live, num_refused=jnp.asarray(tried.info.num_refused),
-        terms=jax.tree.map(jnp.mean, found.terms),
+        terms=jax.tree.map(jnp.mean, drawn.terms),
     )  # fmt: skip
 
 
@@ -205,11 +206,12 @@ def attempt(
         backgrounds = jax.random.uniform(keys[0], (len(batch.viewmats), 3), dtype)
     else:
         backgrounds = jnp.full((len(batch.viewmats), 3), 1.0 if settings.background == "white" else 0.0, dtype)
-    own = tuple(known.rows[rows] for known in state.corrections)
+    correction_rows = tuple(correction.rows[rows] for correction in state.corrections)
     is_gathering = any(s is not None and e.statistic for e, s in zip(stage.events, state.events, strict=True))
-    found = batch_gradients(settings, stage, clock, model, batch, backgrounds, iteration, own, is_gathering)
-    # Without the gradients of corrections, each of which belongs to one view.
-    grads = jax.tree.map(lambda g: jnp.mean(g, axis=0), found.grads[:2])
+    drawn = batch_gradients(settings, stage, clock, model, batch, backgrounds, iteration, correction_rows, is_gathering)
+    of_gaussians, of_appearance, of_corrections = drawn.grads
+    # Gradients of corrections belong to one view each.
+    grads = jax.tree.map(lambda g: jnp.mean(g, axis=0), (of_gaussians, of_appearance))
 
     progress = clock.progress(state.iteration)
     decay = jnp.exp(clock.log_decay * progress)
@@ -221,13 +223,13 @@ def attempt(
 
     height, width = batch.images.shape[1:3]
     cameras = Camera(batch.viewmats, batch.Ks, width, height)
-    if own:
-        cameras = jax.vmap(functools.partial(corrected_camera, stage.corrections))(own, cameras)
+    if correction_rows:
+        cameras = jax.vmap(functools.partial(corrected_camera, stage.corrections))(correction_rows, cameras)
     # ∂L/∂colour: the colour is linear in the first coefficient, with the factor SH_C0.
-    colors = found.grads[0].sh[:, :, 0] / SH_C0
+    colors = of_gaussians.sh[:, :, 0] / SH_C0
     statistic = jnp.zeros_like(colors), jnp.zeros(colors.shape[:2], bool)
-    if found.statistic is not None and stage.statistic is not None:
-        statistic = read_probe(found.statistic, stage.statistic, width, height)
+    if drawn.statistic is not None and stage.statistic is not None:
+        statistic = read_probe(drawn.statistic, stage.statistic, width, height)
     at = clock.scheduled(iteration)
     length = jnp.asarray(clock.num_iterations)
     now = Now(keys[1:], at, stage.cooled(rate, progress), length, scene_scale)
@@ -235,22 +237,23 @@ def attempt(
         settings.due, stage, clock, iteration, now, Seen(cameras, *statistic, colors), model, moments, state.events
     )
     corrections = tuple(
-        updated(correction, known, rows, grad, progress)  # type: ignore[arg-type]
-        for correction, known, grad in zip(stage.corrections, state.corrections, found.grads[2], strict=True)
+        updated(correction, correction_state, rows, grad, progress)  # type: ignore[arg-type]
+        for correction, correction_state, grad in zip(stage.corrections, state.corrections, of_corrections, strict=True)
     )
     after = TrainState(change.model, change.moments, events, iteration, state.status, corrections)
     made: Any = partition(change.model)[0]
     if settings.due is not None:
-        # Adam's steps are finite if gradients are. A check of what nothing else changed makes a GPU write it twice.
-        # What no projection or event changed is the same tracer.
-        known_ids = {id(leaf) for leaf in jax.tree.leaves(step.params)}
-        made = [leaf for leaf in jax.tree.leaves(made) if id(leaf) not in known_ids]
-    checked = jax.tree.leaves((found.loss, grads, found.grads[2], made, [known.rows for known in corrections]))
-    # Row by row first, then one reduction of all rows. Without the barrier XLA would reduce each leaf to one flag
-    # apart, which costs a GPU two launches a leaf.
+        # Adam's results are finite if the gradients are. Only leaves that a projection or an event has changed, which
+        # are other tracers, are checked, because the check makes a GPU write a leaf twice.
+        ids_after_adam = {id(leaf) for leaf in jax.tree.leaves(step.params)}
+        made = [leaf for leaf in jax.tree.leaves(made) if id(leaf) not in ids_after_adam]
+    rows_after = [correction.rows for correction in corrections]
+    checked = jax.tree.leaves((drawn.loss, grads, of_corrections, made, rows_after))
+    # Row by row first, then one reduction of all rows. Without the barrier XLA would reduce each leaf separately to one
+    # flag, which costs a GPU two launches a leaf.
     are_finite = [jnp.all(jnp.isfinite(leaf), axis=tuple(range(1, leaf.ndim))) for leaf in map(jnp.atleast_1d, checked)]
     is_finite = jnp.all(jax.lax.optimization_barrier(jnp.concatenate(are_finite)))
-    return Attempt(found, (*grads, found.grads[2]), after, change.info, is_finite)
+    return Attempt(drawn, (*grads, of_corrections), after, change.info, is_finite)
 
 
 def batch_gradients(
@@ -261,13 +264,13 @@ def batch_gradients(
     batch: Photographs,
     backgrounds: Array,
     iteration: Array,
-    own: tuple[Array, ...],
+    correction_rows: tuple[Array, ...],
     is_gathering: bool,
 ) -> BatchGradients:
     """Return loss and gradients of V views, which a device draws one after the other.
 
-    Backgrounds are [V, 3], and `own` has the rows [V, ...] of each correction. If an event still gathers the stage's
-    statistic, `is_gathering` is True.
+    Backgrounds are [V, 3]; `correction_rows` has the rows [V, ...] of each correction. `is_gathering`: whether an event
+    still gathers the stage's statistic.
     """
     height, width = batch.images.shape[1:3]
     highest = settings.render.sh_degree
@@ -278,27 +281,29 @@ def batch_gradients(
     }  # fmt: skip
 
     def loss(
-        shown: Model, seen: TracedView, output: RenderOutput
+        model: Model, view: TracedView, output: RenderOutput
     ) -> tuple[Array, tuple[Array, Array, dict[str, Array]]]:
-        image, alpha, mask, depth = seen.target
-        photograph = over_background(image, alpha, seen.background)
-        color = corrected_color(seen.corrections, seen.rows, output.color)
+        image, alpha, mask, depth = view.target
+        photograph = over_background(image, alpha, view.background)
+        color = corrected_color(view.corrections, view.rows, output.color)
         if mask is not None:  # Excluded pixels of both are black, so that they add to no loss term.
-            photograph, color = (jnp.where(mask[..., None], x, jnp.zeros_like(x)) for x in (photograph, color))
-        target = Target(seen.camera, photograph, seen.background, mask, clock.progress(iteration - 1), depth)
+            photograph = jnp.where(mask[..., None], photograph, jnp.zeros_like(photograph))
+            color = jnp.where(mask[..., None], color, jnp.zeros_like(color))
+        target = Target(view.camera, photograph, view.background, mask, clock.progress(iteration - 1), depth)
         output = dataclasses.replace(output, color=color)
         parts_by_name: dict[str, Array] = {}
         values: list[Array] = []
         for index, term in enumerate(stage.losses):
             if hasattr(term, "parts"):
-                parts: dict[str, Array] = term.parts(shown, target, output)
+                parts: dict[str, Array] = term.parts(model, target, output)
             else:
-                parts = {getattr(term, "name", type(term).__name__): term(shown, target, output)}
+                parts = {getattr(term, "name", type(term).__name__): term(model, target, output)}
             for name, part in parts.items():
                 check_scalar(f"stage {stage.name!r}: losses[{index}]", part)
                 parts_by_name[name if name not in parts_by_name else f"{name}_{index + 1}"] = part
             values.append(functools.reduce(jnp.add, parts.values()))
-        if added := penalties(seen.corrections, seen.rows):
+        added = penalties(view.corrections, view.rows)
+        if added:
             parts_by_name["corrections"] = functools.reduce(jnp.add, added)
         value = functools.reduce(jnp.add, [*values, *added])
         # PSNR is of what a screen shows; the loss is of unclipped colours (`losses`).
@@ -310,16 +315,17 @@ def batch_gradients(
     def gradients_of(model: Model, arrays: tuple[Any, ...]) -> BatchGradients:
         viewmat, K, background, rows, pictures = arrays
         view = TracedView(Camera(viewmat, K, width, height, batch.rays), background, stage.corrections, rows, pictures)
-        found = differentiate(loss, model, view, settings.render, **options)
-        error, overflow, terms = found.auxiliary
-        grads = found.gaussians, found.appearance, found.rows
-        return BatchGradients(found.value, -10 * jnp.log10(error), found.num_pairs, overflow, grads, found.probe, terms)
+        result = differentiate(loss, model, view, settings.render, **options)
+        error, overflow, terms = result.auxiliary
+        grads = result.gaussians, result.appearance, result.rows
+        psnr = -10 * jnp.log10(error)
+        return BatchGradients(result.value, psnr, result.num_pairs, overflow, grads, result.probe, terms)
 
     def gradients_of_views(model: Model, arrays: tuple[Any, ...]) -> BatchGradients:
         return jax.lax.map(functools.partial(gradients_of, model), arrays)
 
     pictures = batch.images, batch.alphas, batch.masks, batch.depths
-    arrays = batch.viewmats, batch.Ks, backgrounds, own, pictures
+    arrays = batch.viewmats, batch.Ks, backgrounds, correction_rows, pictures
     views = in_views(settings.mesh, gradients_of_views)(model, arrays)
     return with_rows_of_views_divided(settings.mesh, views)
 
@@ -343,20 +349,21 @@ def _events(
     """Gather statistics for the events, and apply those inside the step, which must keep all shapes."""
     nothing = EventInfo(jnp.asarray(True), jnp.zeros((), jnp.int32))
     infos = nothing
-    left = []
-    at = 0
-    known = due or (None,) * len(stage.events)
-    for event, times, state, is_due in zip(stage.events, clock.times, states, known, strict=True):
+    new_states = []
+    first_key = 0
+    are_due = due or (None,) * len(stage.events)
+    for event, times, state, is_due in zip(stage.events, clock.times, states, are_due, strict=True):
         name = f"stage {stage.name!r}: {type(event).__name__}"
         if state is not None and event.observes:
-            before = state
-            state = event.observe(state, model, seen)
-            check_kept(f"{name}.observe", state, before)
+            observed = event.observe(state, model, seen)
+            check_kept(f"{name}.observe", observed, state)
+            state = observed
         if isinstance(event, StepEvent):
-            own = now._replace(keys=now.keys[at : at + event.num_keys], times=times)
-            at += event.num_keys
+            keys = now.keys[first_key : first_key + event.num_keys]
+            of_event = now._replace(keys=keys, times=times)
+            first_key += event.num_keys
 
-            def apply(carry: tuple[Any, ...], event: StepEvent = event, now: Now = own) -> tuple[Any, ...]:
+            def apply(carry: tuple[Any, ...], event: StepEvent = event, now: Now = of_event) -> tuple[Any, ...]:
                 model, moments, state = carry
                 with calling(event, "apply", stage.name):
                     change = checked_change(event.apply(now, model, moments, state))
@@ -374,5 +381,5 @@ def _events(
                 wait = lambda carry: (*carry, nothing)  # noqa: E731
                 model, moments, state, info = jax.lax.cond(times.is_due(iteration), apply, wait, carry)
             infos = EventInfo(infos.is_possible & info.is_possible, infos.num_refused + info.num_refused)
-        left.append(state)
-    return Change(model, moments, None, infos), tuple(left)
+        new_states.append(state)
+    return Change(model, moments, None, infos), tuple(new_states)

@@ -145,7 +145,7 @@ class RobustPhotometric:
     factor: float = 4.0
     """Least residual of what is left out, as a multiple of the photograph's median."""
     start: float = 0.25
-    """Share of the stage after which something is left out; before, what is not learned yet would be."""
+    """Share of the stage after which something is left out; earlier it would be what is not learned yet."""
     has_ssim: bool = static(default=True)
     """Whether to compute SSIM. Without it, images smaller than its window can be trained on."""
 
@@ -155,7 +155,8 @@ class RobustPhotometric:
     def parts(self, model: Model, target: Target, output: RenderOutput) -> dict[str, Array]:
         residual = jnp.mean(jnp.abs(output.color - target.image), axis=-1)
         counts = inliers(residual, self.share, self.factor, target.mask) | (target.progress < self.start)
-        color, image = (jnp.where(counts[..., None], x, jnp.zeros_like(x)) for x in (output.color, target.image))
+        color = jnp.where(counts[..., None], output.color, jnp.zeros_like(output.color))
+        image = jnp.where(counts[..., None], target.image, jnp.zeros_like(target.image))
         return photometric_parts(color, image, ssim_weight=self.ssim_weight if self.has_ssim else 0)
 
 
@@ -184,15 +185,16 @@ def inliers(residual: Array, share: Array | float, factor: Array | float, mask: 
         reach = ((REACH, REACH),) * 2
         return jax.lax.reduce_window(patches, zero, jax.lax.add, around, (1, 1), reach)
 
-    sums, nums = (sums_around(x) for x in (jax.lax.stop_gradient(residual) * counts, counts))
+    sums = sums_around(jax.lax.stop_gradient(residual) * counts)
+    nums = sums_around(counts)
     # NaN: patches without pixels that count are no part of the quantiles, and pass as inliers.
     patches = jnp.where(nums > 0, sums / jnp.maximum(nums, 1), jnp.nan)
     quantiles = jnp.stack([jnp.asarray(0.5, residual.dtype), 1 - jnp.asarray(share, residual.dtype)])
     middle, high = jnp.nanquantile(patches, quantiles)
     # Not `<=`, which is False for NaN.
     is_fine = ~(patches > jnp.maximum(high, factor * middle))
-    found = jnp.repeat(jnp.repeat(is_fine, side, axis=0), side, axis=1)
-    return found[:height, :width]
+    is_inlier = jnp.repeat(jnp.repeat(is_fine, side, axis=0), side, axis=1)
+    return is_inlier[:height, :width]
 
 
 DepthKind = Literal["inverse", "depth"]
@@ -250,10 +252,12 @@ def scale_and_shift(prior: Array, inverse: Array, counts: Array, *, has_shift: b
     """
     weights = counts.astype(prior.dtype)
     num = jnp.maximum(jnp.sum(weights), 1)
-    zero = jnp.zeros((), prior.dtype)
-    middle, wanted = (jnp.sum(weights * x) / num if has_shift else zero for x in (prior, inverse))
+    mean_prior = mean_inverse = jnp.zeros((), prior.dtype)
+    if has_shift:
+        mean_prior = jnp.sum(weights * prior) / num
+        mean_inverse = jnp.sum(weights * inverse) / num
     # Centred on the means, which leaves t out of the equation of s, and cancels less in float32.
-    centered = weights * (prior - middle)
-    scale = safe_divide(jnp.sum(centered * (inverse - wanted)), jnp.sum(centered * centered))
+    centered = weights * (prior - mean_prior)
+    scale = safe_divide(jnp.sum(centered * (inverse - mean_inverse)), jnp.sum(centered * centered))
     scale = jnp.maximum(scale, 0)
-    return scale, wanted - scale * middle
+    return scale, mean_inverse - scale * mean_prior

@@ -28,7 +28,7 @@ CALLS = {
 }
 """Primitives that run their jaxpr once, by their names in all versions of JAX from 0.10 on."""
 CUTOFF_SLACK = 1e-3
-"""Added to the squared distance within which a pixel is looked at; what it shows is decided exactly."""
+"""Margin of the squared distance within which kernels evaluate a pixel; what it then shows is exact."""
 
 
 class Untranslatable(ValueError):
@@ -71,13 +71,13 @@ def in_clean_context(work: Callable[[], object]) -> Any:
 def _whole_power(x: Array, y: int) -> Array:
     """Return x^y by repeated squaring: bits of |y| from the lowest on, as the power runs through x, x², x⁴, …"""
     power = x
-    left = abs(y)
+    bits = abs(y)
     result = None
-    while left:
-        if left & 1:
+    while bits:
+        if bits & 1:
             result = power if result is None else result * power
-        left >>= 1
-        power = power * power if left else power
+        bits >>= 1
+        power = power * power if bits else power
     result = jnp.ones_like(x) if result is None else result
     return 1 / result if y < 0 else result
 
@@ -238,24 +238,24 @@ def refusal_of(settings: PassSettings, translate: Callable[[PassSettings], objec
 def _place_of(primitive: str, settings: PassSettings) -> str:
     """Return in which function of an appearance a primitive occurs, as in " in MyRule.shade"; "" if in none."""
 
-    def gradient(*given: Any) -> Any:
-        results, pull_back = jax.vjp(function, *given)
+    def gradient(*arguments: Any) -> Any:
+        results, pull_back = jax.vjp(function, *arguments)
         return pull_back(results)
 
-    for name, given in settings.arguments.of(()).items():
+    for name, examples in settings.arguments.of(()).items():
         function = getattr(settings.static.functions, name)
-        if primitive in _primitives(trace(function, *given)[0]):
+        if primitive in _primitives(trace(function, *examples)[0]):
             return f" in {settings.static.name}.{name}"
         # Texture regions are integers, which have no gradient.
-        if name != "texel_position" and primitive in _primitives(trace(gradient, *given)[0]):
+        if name != "texel_position" and primitive in _primitives(trace(gradient, *examples)[0]):
             return f" in the gradient of {settings.static.name}.{name}"
     return ""
 
 
 def _primitives(jaxpr: Any) -> set[str]:
     """Return the names of the primitives of a jaxpr and of the jaxprs within it."""
-    found: set[str] = set()
+    names: set[str] = set()
     for equation in getattr(jaxpr, "jaxpr", jaxpr).eqns:
         inner = [leaf for leaf in jax.tree.leaves(tuple(equation.params.values())) if hasattr(leaf, "eqns")]
-        found |= {equation.primitive.name}.union(*map(_primitives, inner))
-    return found
+        names |= {equation.primitive.name}.union(*map(_primitives, inner))
+    return names

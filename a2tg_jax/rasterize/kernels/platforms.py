@@ -37,25 +37,25 @@ REMEDIES: dict[Compositor, str] = {
 """Requirements of the same compositors."""
 
 
-def check_compositor(wanted: Wanted) -> None:
+def check_compositor(compositor: Wanted) -> None:
     """Raise ValueError if a package that a compositor needs is not installed."""
-    if wanted != "auto":
-        choose(wanted, PLATFORMS.get(wanted, ""))
+    if compositor != "auto":
+        choose(compositor, PLATFORMS.get(compositor, ""))
 
 
-def choose(wanted: Wanted, platform: str) -> Compositor:
-    """Return the compositor that is wanted, or with "auto" the fastest one for the platform that JAX compiles for.
+def choose(compositor: Wanted, platform: str) -> Compositor:
+    """Return the given compositor, or for "auto" the fastest one for the platform that JAX compiles for.
 
     Raises:
       ValueError: if the compositor does not run on that platform, or a package that it needs is not installed.
     """
-    if wanted == "auto":
+    if compositor == "auto":
         if is_available("native", platform):
             return "native"
         return "cuda" if platform == PLATFORMS["cuda"] and not wants_determinism() and has_cuda() else "xla"
-    if wanted in PLATFORMS and not is_available(wanted, platform):
-        raise ValueError(f"compositor={wanted!r} needs {REMEDIES[wanted]}, or 'auto'")
-    return wanted
+    if compositor in PLATFORMS and not is_available(compositor, platform):
+        raise ValueError(f"compositor={compositor!r} needs {REMEDIES[compositor]}, or 'auto'")
+    return compositor
 
 
 def is_available(compositor: Compositor, platform: str) -> bool:
@@ -69,14 +69,14 @@ def wants_determinism() -> bool:
     """Return whether XLA_FLAGS request reproducible results on GPUs, which the CUDA kernels' atomic sums are not."""
     words = (word.partition("=") for word in os.environ.get("XLA_FLAGS", "").split())
     # Of a flag that occurs several times, the last one holds.
-    given = {flag: value.lower() in ("", "true", "1") for flag, _, value in words}
-    return any(given.get(flag, False) for flag in DETERMINISM_FLAGS)
+    is_on = {flag: value.lower() in ("", "true", "1") for flag, _, value in words}
+    return any(is_on.get(flag, False) for flag in DETERMINISM_FLAGS)
 
 
-def instead_of(wanted: Wanted, appearance: type, reason: str) -> None:
+def instead_of(compositor: Wanted, appearance: type, reason: str) -> None:
     """Warn, once per class, that XLA composites an appearance that kernels cannot run; ValueError if they must."""
-    if wanted != "auto":
-        raise ValueError(f"compositor={wanted!r} cannot run {appearance.__name__}: {reason}. Say 'xla', or 'auto'")
+    if compositor != "auto":
+        raise ValueError(f"compositor={compositor!r} cannot run {appearance.__name__}: {reason}. Say 'xla', or 'auto'")
     _warn_of_fallback(appearance, reason)
 
 
@@ -133,10 +133,10 @@ def by_platform(
     """
     flat, structure = jax.tree.flatten(arrays)
     shapes, structure_of_results = jax.tree.flatten(results)
-    found = by_platform_p.bind(
+    flat_results = by_platform_p.bind(
         *flat, code_of=code_of, static=static, structure=structure, shapes=tuple(shapes), axes=(), advice=advice
     )
-    return vary_with(flat, jax.tree.unflatten(structure_of_results, found))
+    return vary_with(flat, jax.tree.unflatten(structure_of_results, flat_results))
 
 
 # Inside shard_map: results of foreign functions, which JAX assumes to be the same on all devices
@@ -195,8 +195,8 @@ def _batched(
     mapped = zip(arrays, of_arrays, strict=True)
     size = next(array.shape[axis] for array, axis in mapped if axis is not None)
     shapes = tuple(jax.ShapeDtypeStruct((size, *shape.shape), shape.dtype) for shape in shapes)
-    found = by_platform_p.bind(*arrays, shapes=shapes, axes=(*axes, tuple(of_arrays)), **parameters)
-    return found, [0] * len(found)
+    results = by_platform_p.bind(*arrays, shapes=shapes, axes=(*axes, tuple(of_arrays)), **parameters)
+    return results, [0] * len(results)
 
 
 def _refuse(*_: object, advice: str, **parameters: object) -> NoReturn:
@@ -211,8 +211,8 @@ def _compiled(parameters: frozenset[tuple[str, Hashable]]) -> jax.stages.Wrapped
 def _now(*arrays: Array, **parameters: object) -> list[Array]:
     # Eagerly too, the platform is known only when JAX compiles; under `jax.disable_jit` as well.
     with jax.disable_jit(False):
-        found: list[Array] = _compiled(frozenset(parameters.items()))(*arrays)
-    return found
+        results: list[Array] = _compiled(frozenset(parameters.items()))(*arrays)
+    return results
 
 
 by_platform_p = Primitive("a2tg_by_platform")

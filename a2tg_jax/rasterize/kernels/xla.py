@@ -170,9 +170,9 @@ class _TracedPass:
         end = jnp.where(is_real, lists.starts[tile + 1], start)
         if lists.pixels is None:
             return Tiles(x, y, end), start
-        own: TilePixels = jax.tree.map(lambda leaf: leaf[tile], lists.pixels)
-        own = own._replace(is_seen=own.is_seen & is_real[:, None])
-        return Tiles(own.centers[:, 0], own.centers[:, 1], end, own), start
+        pixels: TilePixels = jax.tree.map(lambda leaf: leaf[tile], lists.pixels)
+        pixels = pixels._replace(is_seen=pixels.is_seen & is_real[:, None])
+        return Tiles(pixels.centers[:, 0], pixels.centers[:, 1], end, pixels), start
 
     def initial_pixels(self, tiles: Tiles) -> tuple[Array, Array]:
         """Return transmittance 1 [G, P], and the live pixels [G, P]: those that are shown."""
@@ -205,8 +205,8 @@ class _TracedPass:
         """Return the splats [G, B, ...] of some ids [G, B], and their texture regions."""
         flat = ids.reshape(-1)
         rows = jax.tree.map(lambda x: x[flat], (self.splats, self.regions))
-        found: tuple[Splats, TextureRegion | None] = jax.tree.map(lambda x: x.reshape(*ids.shape, *x.shape[1:]), rows)
-        return found
+        blocks: tuple[Splats, TextureRegion | None] = jax.tree.map(lambda x: x.reshape(*ids.shape, *x.shape[1:]), rows)
+        return blocks
 
     def pixel_offsets(self, tile: Tiles) -> tuple[Array, Array]:
         """Return x and y of a tile's pixels, each [1, P]: from its centre, or in its frame."""
@@ -261,8 +261,7 @@ class _TracedPass:
 
         is_shown = self.is_listed(at, tile)
         if self.in_any_mode:
-            # Far away from what is shown, derivatives may overflow. A plane that faces the camera keeps them out of the
-            # sums.
+            # Derivatives may overflow where a splat does not show; with the planes of `_FACING` there, they do not.
             is_shown &= ~(jax.lax.stop_gradient(show(planes).alpha) == 0)
             planes = jax.tree.map(lambda entry, facing: jnp.where(is_shown, entry, facing), planes, _FACING)
         shown = show(planes)
@@ -286,8 +285,9 @@ class _TracedPass:
         """
         splats, regions = rows
         # Texels are read once, outside of what is differentiated; `backward` adds to their gradient.
-        found = self.hit(self.spread(splats, tile)[1], tile)
-        lookup = self.look_up(regions, found)
+        _, planes = self.spread(splats, tile)
+        hit = self.hit(planes, tile)
+        lookup = self.look_up(regions, hit)
 
         def of_floats(splats: Splats, values: tuple[Array, ...], rho_probe: Array | None) -> pixel.Shown:
             splat, planes = self.spread(splats, tile)
@@ -300,13 +300,15 @@ class _TracedPass:
         rho_probe = jnp.zeros((BLOCK, transmittance.shape[0]), transmittance.dtype) if statistic else None
         shown, pull_back = jax.vjp(of_floats, splats, _values_of(lookup), rho_probe)
         g = g[:, None]
-        seen: Any = sum(channel * g[k] for k, channel in enumerate(shown.channels))
+        g_dot_c: Any = sum(channel * g[k] for k, channel in enumerate(shown.channels))
 
-        def add_splat(carry: pixel.State, splat: tuple[Array, Array]) -> tuple[pixel.State, tuple[Array, Array]]:
-            weight, *after, d_alpha = pixel.absorb_vjp(splat[0], *carry, splat[1])
-            return (after[0], after[1], after[2]), (weight, d_alpha)
+        def add_splat(state: pixel.State, splat: tuple[Array, Array]) -> tuple[pixel.State, tuple[Array, Array]]:
+            alpha, g_dot_c = splat
+            weight, transmittance, is_live, suffix_sum, d_alpha = pixel.absorb_vjp(alpha, *state, g_dot_c)
+            return (transmittance, is_live, suffix_sum), (weight, d_alpha)
 
-        carry, (weights, d_alpha) = jax.lax.scan(add_splat, (transmittance, is_live, suffix_sum), (shown.alpha, seen))
+        state = (transmittance, is_live, suffix_sum)
+        state, (weights, d_alpha) = jax.lax.scan(add_splat, state, (shown.alpha, g_dot_c))
         d_shown = pixel.Shown(d_alpha, tuple(weights * g[k] for k in range(self.settings.num_channels)))
         d_splats, d_values, d_rho = pull_back(d_shown)
         d_probe = d_texels = None
@@ -314,14 +316,14 @@ class _TracedPass:
             M = jax.tree.map(lambda entry: entry[:, None], _split(splats, False).M)
             # Of a splat that does not show, the slope of the falloff may be NaN.
             d_rho = jnp.where(weights > 0, d_rho, 0.0)
-            of_pixels = found, *self.pixel_offsets(tile), _numbers_of(tile), d_rho, jacobian
+            of_pixels = hit, *self.pixel_offsets(tile), _numbers_of(tile), d_rho, jacobian
             components = pixel.positional_gradient(statistic, M, *of_pixels)
             num_pixels = (weights > 0).astype(d_rho.dtype)
             d_probe = jnp.stack([pixel_sum(numbers) for numbers in (*components, num_pixels)], axis=1)
         if lookup is not None:
             addends = [jnp.stack([corner.weight * d for d in d_values], axis=-1) for corner in lookup.corners]
             d_texels = jnp.stack([corner.texel for corner in lookup.corners]), jnp.stack(addends)
-        return *carry, (d_splats, d_probe, d_texels)
+        return *state, (d_splats, d_probe, d_texels)
 
 
 def _has_splats_left(ends: Array, carry: tuple[Any, ...]) -> Array:

@@ -77,8 +77,9 @@ def largest_difference(device: object) -> float:
 
     with jax.default_device(device):
         draw = jax.jit(drawn, static_argnums=0)
-        found, wanted = (draw(module, splats, texels, regions, cutoff, jacobian, probe, g) for module in (cuda, xla))
-    return relative_difference(found, wanted)
+        results = draw(cuda, splats, texels, regions, cutoff, jacobian, probe, g)
+        references = draw(xla, splats, texels, regions, cutoff, jacobian, probe, g)
+    return relative_difference(results, references)
 
 
 def _inputs() -> tuple[PassSettings, tuple[Any, ...]]:
@@ -88,7 +89,12 @@ def _inputs() -> tuple[PassSettings, tuple[Any, ...]]:
     def draw(low: float, high: float, *shape: int) -> Any:
         return rng.uniform(low, high, (*shape, NUM)).astype(np.float32).T
 
-    x, y, depth, angle, u, v = draw(0, GRID.width), draw(0, GRID.height), *(draw(1, most) for most in (3, 4, 6, 6))
+    x = draw(0, GRID.width)
+    y = draw(0, GRID.height)
+    depth = draw(1, 3)
+    angle = draw(1, 4)
+    u = draw(1, 6)
+    v = draw(1, 6)
     u_tilt = draw(-0.05, 0.05)
     v_tilt = draw(-0.05, 0.05)
     # Columns of M: the axes u and v of a splat of 1 to 6 pixels, slightly inclined, and its centre.

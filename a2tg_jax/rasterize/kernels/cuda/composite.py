@@ -45,11 +45,11 @@ def backward(
 ) -> tuple[Splats, Array, Array]:
     """Return the cotangents of splats, texels and probe, as `xla.backward` does."""
     dtype = np.dtype(settings.dtype)
-    given = (*pack_inputs(settings, inputs), *(array.astype(dtype) for array in (g, suffix_sum, jacobian)))
+    operands = (*pack_inputs(settings, inputs), *(array.astype(dtype) for array in (g, suffix_sum, jacobian)))
     # Blocks add to these atomically: they start as zeros, and are operands that the call returns.
     totals = [jnp.zeros(shape, dtype) for shape in settings.gradient_shapes(inputs)]
-    found = launch(settings.kernel, "backward", settings.grid.num, given, [], totals)
-    return unpack_gradients(settings, found, inputs, probe)
+    gradients = launch(settings.kernel, "backward", settings.grid.num, operands, [], totals)
+    return unpack_gradients(settings, gradients, inputs, probe)
 
 
 def launch(
@@ -58,14 +58,14 @@ def launch(
 ) -> list[Array]:  # fmt: skip
     """Run a kernel of `source.source` on a GPU.
 
-    Its parameters are pointers to the inputs, which it reads, then to results, which it writes whole and which are
-    given by shape and dtype, or totals, which it adds to. Returns the results, then the totals.
+    Its parameters are pointers to the inputs, which it reads, then to the results (given by shape and dtype), which it
+    writes whole, or to the totals, which it adds to. Returns the results, then the totals.
     """
     try:
-        found = [device.compute_capability for device in jax.local_devices(backend="cuda")]
+        capabilities = [device.compute_capability for device in jax.local_devices(backend="cuda")]
     except RuntimeError:
-        found = [DEFAULT_CAPABILITY]
-    capability = min(found, key=lambda text: [int(part) for part in text.split(".")])
+        capabilities = [DEFAULT_CAPABILITY]
+    capability = min(capabilities, key=lambda text: [int(part) for part in text.split(".")])
     program = nvrtc.ptx(source(kernel, "cuda"), capability)
     tile_size = kernel.grid.tile_size
     shapes = [*results, *(jax.typeof(total) for total in totals)]

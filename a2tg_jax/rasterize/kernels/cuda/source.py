@@ -84,7 +84,8 @@ def source(kernel: PassSettings, dialect: Dialect) -> str:
     defines = "".join(f"#define {name} {value}\n" for name, value in constants.items())
     real = f"typedef {'float' if kernel.dtype == 'float32' else 'double'} real;\n"
     folder = resources.files(__package__)
-    header, kernels = (folder.joinpath(name).read_text(encoding="utf-8") for name in (f"{dialect}.h", "tiles.c"))
+    header = folder.joinpath(f"{dialect}.h").read_text(encoding="utf-8")
+    kernels = folder.joinpath("tiles.c").read_text(encoding="utf-8")
     if dialect == "opencl" and kernel.dtype == "float64":
         real = "#pragma OPENCL EXTENSION cl_khr_fp64 : enable\n" + real
     return "\n".join([defines + real, header, *_pixel_functions(kernel, functions, count), kernels])
@@ -116,12 +117,12 @@ def _pixel_functions(kernel: PassSettings, functions: PixelFunctions, count: int
     pixel = Argument("x"), Argument("y"), Argument("transmittance"), Argument("is_live", kind="int")
     state = Argument("transmittance_after"), Argument("is_live_after", kind="int")
     channels = Argument("channels", kernel.num_channels)
-    after = Argument("channels_after", kernel.num_channels)
+    channels_after = Argument("channels_after", kernel.num_channels)
     printed = [
         c_function("prepare", functions.prepare, [M, *tile], [planes]),
         c_function("prepare_vjp", functions.prepare_vjp, [M, *tile, planes], [Argument("d_M", 9)]),
         c_function("reach", functions.reach, [planes, region, *pixel[:2]], [Argument("rho"), position]),
-        c_function("blend", functions.forward, [planes, numbers, sample, *pixel, channels], [*state, after]),
+        c_function("blend", functions.forward, [planes, numbers, sample, *pixel, channels], [*state, channels_after]),
         c_function(
             "blend_vjp",
             functions.backward,
@@ -154,12 +155,18 @@ def _texture_functions(kernel: PassSettings, region: Argument, position: Argumen
 
     weights = ((number,) * 4,) * 3
     at_corners = ((number,) * kernel.num_columns,) * 4
-    found = [Argument("texel", 4, "int"), Argument("weights", 12)]
-    given = [region, Argument("weights", 12), Argument("at_corners", 4 * kernel.num_columns)]
+    texel = Argument("texel", 4, "int")
+    weight = Argument("weights", 12)
+    at_corner = Argument("at_corners", 4 * kernel.num_columns)
     sample = Argument("sample", 3 * kernel.num_columns)
     return [
-        c_function("corners", trace(corners, place, number, number)[0], [region, position], found),
-        c_function("interpolate", trace(interpolate, place, weights, at_corners)[0], given, [sample]),
+        c_function("corners", trace(corners, place, number, number)[0], [region, position], [texel, weight]),
+        c_function(
+            "interpolate",
+            trace(interpolate, place, weights, at_corners)[0],
+            [region, weight, at_corner],
+            [sample],
+        ),
     ]
 
 
@@ -177,11 +184,11 @@ def c_function(name: str, closed: core.ClosedJaxpr, inputs: Sequence[Argument], 
     def assign(emit: Emitter, operands: list[str], equation: Equation) -> str:
         return variable(result_dtype(equation), emit(operands, equation))
 
-    given = [entry for argument in inputs for entry in argument.entries()]
-    # Copies of the arguments, since a result may have the same address as one of them.
-    kept = [variable(aval.dtype, x) for aval, x in zip(closed.in_avals, given, strict=True)]
+    entries = [entry for argument in inputs for entry in argument.entries()]
+    # Copied, because a result may have the same address as an argument.
+    copies = [variable(aval.dtype, entry) for aval, entry in zip(closed.in_avals, entries, strict=True)]
     primitives = {name: functools.partial(assign, emit) for name, emit in PRIMITIVES.items()}
-    results = make_code(closed, kept, literal, primitives, "GPU kernels")
+    results = make_code(closed, copies, literal, primitives, "GPU kernels")
     places = [entry if a.num is not None else f"*{entry}" for a in outputs for entry in a.entries()]
     parameters = [f"{a.kind} {a.name}" if a.num is None else f"const {a.kind} *{a.name}" for a in inputs]
     parameters += [f"{a.kind} *{a.name}" for a in outputs]
@@ -202,7 +209,8 @@ def literal(value: ArrayLike, dtype: DTypeLike) -> str:
     kind = _c_type(dtype)
     dtype = np.dtype(dtype)
     if dtype.kind in "bi":
-        number, suffix = int(value), "l" if dtype.itemsize == 8 else ""  # type: ignore[arg-type]
+        number = int(value)  # type: ignore[arg-type]
+        suffix = "l" if dtype.itemsize == 8 else ""
         # C reads −2³¹ as minus a number that does not fit.
         is_least = dtype.kind == "i" and number == np.iinfo(dtype).min
         return f"({number + 1}{suffix} - 1)" if is_least else f"({number}{suffix})"
@@ -253,7 +261,8 @@ def _convert(x: list[str], equation: Equation) -> str:
     if source.kind == "f" and target.kind == "i":
         info = np.iinfo(target)
         # The floats at and beyond which a conversion gives the least and the largest integer.
-        low, high = (literal(bound, source) for bound in (float(info.min), float(source.type(info.max))))
+        low = literal(float(info.min), source)
+        high = literal(float(source.type(info.max)), source)
         least = literal(info.min, target)
         most = literal(info.max, target)
         return f"{x[0]} != {x[0]} ? 0 : {x[0]} <= {low} ? {least} : {x[0]} >= {high} ? {most} : {cast}"
@@ -261,10 +270,10 @@ def _convert(x: list[str], equation: Equation) -> str:
 
 
 def _select(x: list[str], equation: Equation) -> str:
-    which, first, *others = x
+    index, first, *others = x
     if operand_dtype(equation) == np.bool_:
-        return f"{which} ? {others[0]} : {first}"
-    cases = [f"{which} <= {k} ? {value} : " for k, value in enumerate([first, *others[:-1]])]
+        return f"{index} ? {others[0]} : {first}"
+    cases = [f"{index} <= {k} ? {value} : " for k, value in enumerate([first, *others[:-1]])]
     return "".join(cases) + (others[-1] if others else first)
 
 

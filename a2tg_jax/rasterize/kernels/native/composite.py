@@ -22,8 +22,12 @@ from a2tg_jax.rasterize.kernels.native.passes import BACKWARD_BYTES, FORWARD_BYT
 from a2tg_jax.rasterize.splats import PassInputs, PassSettings, Splats, pack_inputs, unpack_gradients
 from a2tg_jax.rasterize.tiles import TileGrid, TileLists
 
-PAIRS_PER_THREAD, SPLATS_PER_THREAD, ROWS_PER_THREAD = 2_000, 10_000, 2_000
-"""Least numbers of pairs, of splats, and of rows of a gradient to add that are worth another thread."""
+PAIRS_PER_THREAD = 2_000
+"""Least number of pairs that is worth another thread."""
+SPLATS_PER_THREAD = 10_000
+"""Least number of splats that is worth another thread."""
+ROWS_PER_THREAD = 2_000
+"""Least number of rows of a gradient to add that is worth another thread."""
 
 
 @functools.cache
@@ -49,8 +53,8 @@ def backward(
     cotangents = [array.astype(dtype) for array in (g, suffix_sum, jacobian)]
     shapes = [(shape, dtype) for shape in settings.gradient_shapes(inputs)]
     name = _registered(settings.kernel, "backward", _backward_handler)
-    found = ffi.call(name, shapes, *_packed(settings, inputs, BACKWARD_BYTES), *cotangents)
-    return unpack_gradients(settings, found, inputs, probe)
+    gradients = ffi.call(name, shapes, *_packed(settings, inputs, BACKWARD_BYTES), *cotangents)
+    return unpack_gradients(settings, gradients, inputs, probe)
 
 
 def _packed(settings: PassSettings, inputs: PassInputs, vector_bytes: int) -> tuple[Array, ...]:
@@ -60,10 +64,10 @@ def _packed(settings: PassSettings, inputs: PassInputs, vector_bytes: int) -> tu
 
 
 def _registered(
-    kernel: PassSettings, which: Literal["forward", "backward"], make_handler: Callable[[CompiledFunction], ffi.Handler]
+    kernel: PassSettings, name: Literal["forward", "backward"], make_handler: Callable[[CompiledFunction], ffi.Handler]
 ) -> str:
-    description = f"compositor=native {which} {kernel!r}"
-    return ffi.registered(description, (which, kernel), lambda: make_handler(compiled_passes(kernel)[which]))
+    description = f"compositor=native {name} {kernel!r}"
+    return ffi.registered(description, (name, kernel), lambda: make_handler(compiled_passes(kernel)[name]))
 
 
 def _forward_handler(run: CompiledFunction) -> ffi.Handler:
@@ -108,7 +112,7 @@ def _parts(starts: np.ndarray) -> list[ffi.Span]:
     num_items = len(starts) - 1
     num_pairs = int(starts[-1])
     count = max(1, min(ffi.num_threads(), num_pairs // PAIRS_PER_THREAD))
-    # A tile costs one more than its pairs, so that tiles without pairs are divided, too.
+    # A tile counts one more than its pairs, so that tiles without pairs are divided as well.
     work = starts.astype(np.int64) + np.arange(num_items + 1)
     borders = np.searchsorted(work, np.linspace(0, work[-1], count + 1)[1:-1]).tolist()
     return list(itertools.pairwise([0, *borders, num_items]))
@@ -159,7 +163,8 @@ class SumsOfParts:
             self.borders.append(self.borders[-1] + len(splats))
         self.splats = np.concatenate(splats_of_parts)
         num = max(1, len(self.splats))
-        self.more_splats, self.more_probe = (np.zeros((num, x.shape[1]), x.dtype) for x in (d_splats, d_probe))
+        self.more_splats = np.zeros((num, d_splats.shape[1]), d_splats.dtype)
+        self.more_probe = np.zeros((num, d_probe.shape[1]), d_probe.dtype)
         has_textures = d_texels.shape[1] > 0 and len(regions) == len(d_splats)
         self.regions = regions[self.splats] if has_textures else np.zeros((0, 3), np.int32)
         # Where textures share texels, two parts may add to the same one: each has its own copy of all.
@@ -241,9 +246,11 @@ def _list_handler(functions: list[CompiledFunction], arguments: list[np.ndarray]
 
     ffi.run_spans(bound, ffi.even_spans(num, SPLATS_PER_THREAD))
     room = int(rectangles[:, 3].sum(dtype=np.int64))
-    total[...], overflow[...] = room, room > len(ids)
-    # XLA hands over buffers as they are, and places behind the last pair are not written.
-    starts[:], ids[:] = 0, 0
+    total[...] = room
+    overflow[...] = room > len(ids)
+    # XLA's buffers are not initialised, and places behind the last pair are not written.
+    starts[:] = 0
+    ids[:] = 0
     if overflow:
         return
     visible = np.flatnonzero(rectangles[:, 3])
@@ -255,8 +262,8 @@ def _list_handler(functions: list[CompiledFunction], arguments: list[np.ndarray]
     tiles, splats = np.empty((2, max(1, room)), np.int32)
 
     def find(first: int, last: int, index: int) -> None:
-        found = tiles[begins[first] :], splats[begins[first] :]
-        buffers = order[first:], rectangles, outlines, counts[index], *found
+        pairs = tiles[begins[first] :], splats[begins[first] :]
+        buffers = order[first:], rectangles, outlines, counts[index], *pairs
         run_find(*_addresses(*buffers), last - first, columns)
 
     ffi.run_spans(find, spans)
@@ -265,8 +272,8 @@ def _list_handler(functions: list[CompiledFunction], arguments: list[np.ndarray]
     cursors = starts[:-1] + np.cumsum(counts, axis=0, dtype=np.int32) - counts
 
     def place(first: int, _: int, index: int) -> None:
-        found = tiles[begins[first] :], splats[begins[first] :]
-        run_place(*_addresses(*found, cursors[index], ids), int(counts[index].sum()))
+        pairs = tiles[begins[first] :], splats[begins[first] :]
+        run_place(*_addresses(*pairs, cursors[index], ids), int(counts[index].sum()))
 
     ffi.run_spans(place, spans)
 

@@ -76,8 +76,10 @@ _LOCK = threading.RLock()
 _AT_THE_END = _ErrorArguments(ctypes.sizeof(_ErrorArguments), None, b"the program is ending", INTERNAL_ERROR)
 ctypes.pythonapi.Py_IncRef(ctypes.py_object(_AT_THE_END))  # in use as long as the process lives
 _entries: dict[str, tuple[Hashable, object]] = {}
-_num_inside, _is_closed = ctypes.c_int32(0), ctypes.c_int32(0)
-"""Threads of XLA inside the gate, and whether it is closed."""
+_num_inside = ctypes.c_int32(0)
+"""Number of threads of XLA inside the gate."""
+_is_closed = ctypes.c_int32(0)
+"""Whether the gate is closed."""
 SECONDS_TO_RETURN = 0.1
 """Time for daemon threads to return from native code to Python, where the end of the program is harmless."""
 
@@ -96,11 +98,12 @@ def refusal() -> str | None:
 
     XLA keeps old minor versions working for a year, but no old major ones.
     """
-    found = installed_version()
-    if found is None or (found[0] == VERSION[0] and found >= VERSION):
+    installed = installed_version()
+    if installed is None or (installed[0] == VERSION[0] and installed >= VERSION):
         return None
-    own, other = (".".join(map(str, version)) for version in (VERSION, found))
-    return f"native loops use version {own} of XLA's foreign function interface, and this jaxlib {other}"
+    used = ".".join(map(str, VERSION))
+    provided = ".".join(map(str, installed))
+    return f"native loops use version {used} of XLA's foreign function interface, and this jaxlib {provided}"
 
 
 def registered(description: str, key: Hashable, make_handler: Callable[[], Handler]) -> str:
@@ -129,10 +132,10 @@ def call(name: str, results: Sequence[tuple[tuple[int, ...], DTypeLike]], *input
 
 
 def _capsule(address: int | None, destructor: int | None = None) -> object:
-    new = ctypes.pythonapi.PyCapsule_New
-    new.restype = ctypes.py_object
-    new.argtypes = (_pointer, ctypes.c_char_p, _pointer)
-    return new(address, None, destructor)
+    new_capsule = ctypes.pythonapi.PyCapsule_New
+    new_capsule.restype = ctypes.py_object
+    new_capsule.argtypes = (_pointer, ctypes.c_char_p, _pointer)
+    return new_capsule(address, None, destructor)
 
 
 GATE = """
@@ -171,7 +174,7 @@ def _gated(entry: Any) -> int:
         entry=ctypes.cast(entry, _pointer).value,
         api=_CallFrame.api.offset,
         create_error=_Api.create_error.offset,
-        **{name: ctypes.addressof(own) for name, own in places.items()},
+        **{field: ctypes.addressof(number) for field, number in places.items()},
     )
     return llvm_code.compile_text(code, [name])[name]
 
@@ -212,15 +215,15 @@ def _entry(handler: Handler) -> Callable[..., int | None]:
 @contextlib.contextmanager
 def _interrupts_noted(interrupts: list[int]) -> Iterator[None]:
     """Append Ctrl-C to a list instead of raising it, on the main thread, the only one that signals reach."""
-    before = signal.getsignal(signal.SIGINT)
-    if threading.get_ident() != threading.main_thread().ident or not callable(before):
+    usual_handler = signal.getsignal(signal.SIGINT)
+    if threading.get_ident() != threading.main_thread().ident or not callable(usual_handler):
         yield
         return
     signal.signal(signal.SIGINT, lambda number, _: interrupts.append(number))
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, usual_handler)
 
 
 def _interrupt_once_dropped() -> object:
@@ -253,16 +256,16 @@ def even_spans(num: int, least_items: int) -> list[Span]:
 
 def run_spans(work: Callable[[int, int, int], None], spans: Sequence[Span]) -> None:
     """Call work(first, last, index) for every span: the first one on this thread, the others on the pool's."""
-    others: list[concurrent.futures.Future[None]] = []
+    futures: list[concurrent.futures.Future[None]] = []
     try:
         for index, span in enumerate(spans[1:], start=1):
-            others.append(_pool(num_threads()).submit(work, *span, index))
+            futures.append(_pool(num_threads()).submit(work, *span, index))
         work(*spans[0], 0)
     finally:
         # Also after an exception: nobody may write to XLA's buffers once they are given back.
-        concurrent.futures.wait(others)
-    for other in others:
-        other.result()
+        concurrent.futures.wait(futures)
+    for future in futures:
+        future.result()
 
 
 @functools.cache
@@ -280,9 +283,9 @@ def _close() -> None:
     """Close the gate, and wait until no thread is inside and none waits for arrays."""
     if not _entries:
         return
-    # Threads use the gate as long as the process lives: its parts must outlive Python's shutdown.
-    for kept in (_num_inside, _is_closed, llvm_code.engine()):
-        ctypes.pythonapi.Py_IncRef(ctypes.py_object(kept))
+    # Threads use the gate as long as the process lives, so its parts must outlive Python's shutdown.
+    for part in (_num_inside, _is_closed, llvm_code.engine()):
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(part))
     _is_closed.value = 1
     while _num_inside.value:
         time.sleep(1e-3)

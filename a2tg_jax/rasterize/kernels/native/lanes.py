@@ -44,8 +44,8 @@ def num_bits(type_: ir.Type) -> int:
 
 def suffix(type_: ir.Type) -> str:
     """Return the spelling of a type in the names of intrinsics."""
-    one = f"{'f' if is_float(type_) else 'i'}{num_bits(type_)}"
-    return f"v{type_.count}{one}" if isinstance(type_, ir.VectorType) else one
+    scalar = f"{'f' if is_float(type_) else 'i'}{num_bits(type_)}"
+    return f"v{type_.count}{scalar}" if isinstance(type_, ir.VectorType) else scalar
 
 
 class Lanes:
@@ -145,12 +145,13 @@ class Lanes:
         for zero, other in ((x, y), (y, x)):
             if _orders_by_compare(zero, 1.0):
                 return self.builder.fadd(self.larger(zero, other), zero)
-        # Two orders that agree are both right. Otherwise there is a NaN, or zeros of both signs: the union of the bits,
-        # with the signs intersected, is the result.
+        # If `larger` gives the same in both orders, that is right. Otherwise there is a NaN, or zeros of both signs, and
+        # the result is the union of the bits, with the signs intersected.
         b = self.builder
         sign = self._sign_bits(x.type)
-        one, other = (b.xor(self._as_bits(self.larger(*pair)), sign) for pair in ((x, y), (y, x)))
-        return b.bitcast(b.xor(b.or_(one, other), sign), x.type)
+        x_first = b.xor(self._as_bits(self.larger(x, y)), sign)
+        y_first = b.xor(self._as_bits(self.larger(y, x)), sign)
+        return b.bitcast(b.xor(b.or_(x_first, y_first), sign), x.type)
 
     def minimum(self, x: ir.Value, y: ir.Value) -> ir.Value:
         """Return IEEE 754's minimum of floats: NaN if either is, and −0 is smaller than +0."""
@@ -159,8 +160,9 @@ class Lanes:
         if _orders_by_compare(x, 1.0):
             return self.smaller(x, y)
         # As in `maximum`, but the union of the signs is the right one: −0 is the smaller zero.
-        one, other = (self._as_bits(self.smaller(*pair)) for pair in ((x, y), (y, x)))
-        return self.builder.bitcast(self.builder.or_(one, other), x.type)
+        x_first = self._as_bits(self.smaller(x, y))
+        y_first = self._as_bits(self.smaller(y, x))
+        return self.builder.bitcast(self.builder.or_(x_first, y_first), x.type)
 
     def _as_bits(self, x: ir.Value) -> ir.Value:
         return self.builder.bitcast(x, self.vector(ir.IntType(num_bits(x.type))))
@@ -228,18 +230,21 @@ def _libm(name: str) -> Emitter:
 
 
 def _divide(lanes: Lanes, operands: Operands, _: Equation) -> ir.Value:
-    (x, y), b = operands, lanes.builder
+    x, y = operands
+    b = lanes.builder
     if is_float(x.type):
         return b.fdiv(x, y, flags=FLAGS)
     number = functools.partial(lanes.constant, scalar=scalar_of(x.type))
-    is_zero, is_minus_one = (b.icmp_signed("==", y, number(divisor)) for divisor in (0, -1))
+    is_zero = b.icmp_signed("==", y, number(0))
+    is_minus_one = b.icmp_signed("==", y, number(-1))
     # Processors may trap at a divisor of 0, and of −1 for the least integer: these get 1 instead.
     quotient = b.sdiv(x, b.select(b.or_(is_zero, is_minus_one), number(1), y))
     return b.select(is_zero, number(-1), b.select(is_minus_one, b.neg(x), quotient))
 
 
 def _shift_right(lanes: Lanes, operands: Operands, _: Equation) -> ir.Value:
-    (x, amount), b = operands, lanes.builder
+    x, amount = operands
+    b = lanes.builder
     most = lanes.constant(num_bits(x.type) - 1, scalar_of(x.type))
     # LLVM leaves shifts by the width or more undefined. As unsigned numbers, negative amounts are too large as well.
     return b.ashr(x, b.select(b.icmp_unsigned("<", amount, most), amount, most))
@@ -253,7 +258,8 @@ def _absolute(lanes: Lanes, operands: Operands, equation: Equation) -> ir.Value:
 
 
 def _convert(lanes: Lanes, operands: Operands, equation: Equation) -> ir.Value:
-    (x,), b = operands, lanes.builder
+    (x,) = operands
+    b = lanes.builder
     source = operand_dtype(equation)
     target = result_dtype(equation)
     type_ = lanes.vector(scalar_type(target))
@@ -278,14 +284,14 @@ def _bitcast(lanes: Lanes, operands: Operands, equation: Equation) -> ir.Value:
 
 
 def _select(lanes: Lanes, operands: Operands, equation: Equation) -> ir.Value:
-    which, first, *others = operands
+    index, result, *others = operands
     if operand_dtype(equation) == np.bool_:
-        return lanes.builder.select(which, others[0], first)
+        return lanes.builder.select(index, others[0], result)
     # XLA clamps the index: the last case holds from its number on, the first one below 1.
     for k, other in enumerate(others, start=1):
-        is_here = lanes.builder.icmp_signed(">=", which, lanes.constant(k, scalar_of(which.type)))
-        first = lanes.builder.select(is_here, other, first)
-    return first
+        is_reached = lanes.builder.icmp_signed(">=", index, lanes.constant(k, scalar_of(index.type)))
+        result = lanes.builder.select(is_reached, other, result)
+    return result
 
 
 # exp and log of float32 from arithmetic, as JAX functions: traced once, then translated as all others. libm would take
@@ -293,8 +299,10 @@ def _select(lanes: Lanes, operands: Operands, equation: Equation) -> ir.Value:
 # whole range. Results below 2⁻¹²⁵ may be zero, and arguments below 2⁻¹²⁶ count as zero, as XLA flushes subnormal
 # numbers on CPUs. The coefficients are minimax fits of this project.
 
-LN2_HIGH, LN2_LOW = 0.693359375, -2.12194440e-4
-"""ln 2 in two parts; the first has trailing zeros, so that its product with a small integer is exact."""
+LN2_HIGH = 0.693359375
+"""Most of ln 2, with trailing zeros, so that its product with a small integer is exact."""
+LN2_LOW = -2.12194440e-4
+"""The rest of ln 2."""
 
 
 def _polynomial(x: Array, *coefficients: float) -> Array:

@@ -59,20 +59,21 @@ def _write_bound(module: ir.Module, name: str, dtype: str, tile_size: int, near_
         cutoff = w.load(given["cutoff"], id_, w.real)
         bounds = scalars.emit(bounds_of, [*numbers, cutoff])
         box = bounds[:4]
-        own = bounds[4:]
+        outline_numbers = bounds[4:]
         for edge, room in zip(box, rooms, strict=True):
             b.store(edge, room)
         # Splats that cross the near plane are few, and their boxes cost more: a branch, not a select.
-        with b.if_then(own[-1]):
-            for edge, room in zip(scalars.emit(clipped, [*numbers, *own, cutoff]), rooms, strict=True):
+        with b.if_then(outline_numbers[-1]):
+            for edge, room in zip(scalars.emit(clipped, [*numbers, *outline_numbers, cutoff]), rooms, strict=True):
                 b.store(edge, room)
         box = [b.load(room, typ=w.real) for room in rooms]
         row = w.at(given["rectangles"], w.times(id_, 4), INT)
-        for k, value in enumerate(scalars.emit(rectangle_of, [*box, *own, given["width"], given["height"]])):
+        size = given["width"], given["height"]
+        for k, value in enumerate(scalars.emit(rectangle_of, [*box, *outline_numbers, *size])):
             w.store(value, row, k)
         row = w.at(given["outlines"], w.times(id_, NUM_NUMBERS), w.real)
         # One table of floats: the flag becomes 0 or 1.
-        for k, value in enumerate([*own[:-1], b.uitofp(own[-1], w.real)]):
+        for k, value in enumerate([*outline_numbers[:-1], b.uitofp(outline_numbers[-1], w.real)]):
             w.store(value, row, k)
     b.ret_void()
 
@@ -83,8 +84,8 @@ def _write_find(module: ir.Module, name: str, dtype: str, tile_size: int) -> Non
     given = w.arguments
     number = example(dtype)
     touches, _ = trace(functools.partial(outline_touches, tile_size=tile_size), _outline_of(dtype), number, number)
-    num_found = w.variable(LONG)
-    b.store(LONG(0), num_found)
+    num_pairs = w.variable(LONG)
+    b.store(LONG(0), num_pairs)
     with w.loop(LONG(0), w.long(given["num_splats"])) as (rank, _):
         id_ = w.load(given["order"], rank, INT)
         rectangle = w.at(given["rectangles"], w.times(w.long(id_), 4), INT)
@@ -92,7 +93,7 @@ def _write_find(module: ir.Module, name: str, dtype: str, tile_size: int) -> Non
         with b.if_then(b.icmp_signed(">", count, INT(0))):
             base = w.at(given["outlines"], w.times(w.long(id_), NUM_NUMBERS), w.real)
             *numbers, is_clipped = (w.load(base, k, w.real) for k in range(NUM_NUMBERS))
-            own = [*numbers, b.fcmp_ordered(">", is_clipped, w.real(0.0))]
+            outline = [*numbers, b.fcmp_ordered(">", is_clipped, w.real(0.0))]
             # Only where there are pairs: without columns this would divide by zero.
             rows = b.sdiv(count, columns)
             with (
@@ -100,13 +101,13 @@ def _write_find(module: ir.Module, name: str, dtype: str, tile_size: int) -> Non
                 w.loop(w.long(x0), w.long(b.add(x0, columns))) as (x, _),
             ):
                 corner = [b.fmul(b.sitofp(index, w.real), w.real(tile_size)) for index in (x, y)]
-                (is_touched,) = Lanes(b, 1).emit(touches, [*own, *corner])
+                (is_touched,) = Lanes(b, 1).emit(touches, [*outline, *corner])
                 with b.if_then(is_touched):
                     tile = b.trunc(b.add(b.mul(y, w.long(given["columns"])), x), INT)
-                    found = b.load(num_found, typ=LONG)
-                    w.store(tile, given["tiles"], found)
-                    w.store(id_, given["splats"], found)
-                    b.store(b.add(found, LONG(1)), num_found)
+                    pair = b.load(num_pairs, typ=LONG)
+                    w.store(tile, given["tiles"], pair)
+                    w.store(id_, given["splats"], pair)
+                    b.store(b.add(pair, LONG(1)), num_pairs)
                     counted = w.load(given["counts"], w.long(tile), INT)
                     w.store(b.add(counted, INT(1)), given["counts"], w.long(tile))
     b.ret_void()

@@ -51,7 +51,8 @@ class Writer:
             argument.add_attribute("noalias")
         self.arguments = dict(zip((*buffers, *integers), function.args, strict=True))
         self.b = ir.IRBuilder(function.append_basic_block("entry"))
-        self.real, self.alignment = scalar_type(dtype), np.dtype(dtype).itemsize
+        self.real = scalar_type(dtype)
+        self.alignment = np.dtype(dtype).itemsize
 
     def variable(self, type_: ir.Type, count: int = 1) -> ir.Value:
         """Return the address of `count` values on the stack."""
@@ -156,7 +157,8 @@ def compile_text(code: str, names: Sequence[str]) -> dict[str, int]:
     """Optimise and compile LLVM assembly; return the addresses of functions, valid as long as the process lives."""
     with _LOCK:
         parsed = llvm.parse_assembly(code)
-        parsed.triple, parsed.data_layout = llvm.get_default_triple(), str(_machine().target_data)
+        parsed.triple = llvm.get_default_triple()
+        parsed.data_layout = str(_machine().target_data)
         parsed.verify()
         dump(names[0], "ll", lambda: str(parsed))
         # Higher levels take half as long again and make no loop faster: pixels are in vectors already.
@@ -177,16 +179,17 @@ def compiled(module: ir.Module, signatures: dict[str, tuple[int, int]]) -> list[
     The signatures are the number of pointers and of integers of each function, by name.
     """
     addresses = compile_text(str(module), list(signatures))
-    found = list[CompiledFunction]()
+    functions = list[CompiledFunction]()
     for name, (pointers, integers) in signatures.items():
         types = [ctypes.c_void_p] * pointers + [ctypes.c_int32] * integers
-        found.append(ctypes.CFUNCTYPE(None, *types)(addresses[name]))
-    return found
+        functions.append(ctypes.CFUNCTYPE(None, *types)(addresses[name]))
+    return functions
 
 
 def dump(name: str, kind: str, make_text: Callable[[], str]) -> None:
     """Write a text to <folder>/<name>.<kind> if the environment variable A2TG_DUMP names a folder."""
-    if folder := os.environ.get("A2TG_DUMP"):
+    folder = os.environ.get("A2TG_DUMP")
+    if folder:
         path = Path(folder) / f"{name}.{kind}"
         path.parent.mkdir(parents=True, exist_ok=True)
         # A function has several jaxprs.

@@ -38,10 +38,12 @@ BACKWARD = (
     *(*FORWARD[:-1], "g", "suffix_sum", "jacobian", "d_splats", "d_texels", "d_probe"),
     *("places", "more_splats", "more_texels", "more_probe", "more_first"),
 )
-FORWARD_BYTES, BACKWARD_BYTES = llvm_code.ALIGNMENT, 64
-"""Size of the vectors of float32 in each pass, several registers of most processors: these work on while results of
-others are awaited, and a branch for many pixels is rarely a surprise. With textures, one register is faster
-(experiments/NOTEBOOK.md, "Speed on CPUs")."""
+# Several registers of most processors: some compute while results of others are awaited, and branches for many pixels
+# are mostly predicted. With textures, one register is faster (experiments/NOTEBOOK.md, "Speed on CPUs").
+FORWARD_BYTES = llvm_code.ALIGNMENT
+"""Size of the vectors of float32 in the forward pass."""
+BACKWARD_BYTES = 64
+"""Size of the vectors of float32 in the backward pass."""
 
 
 def lanes_of(settings: PassSettings, vector_bytes: int) -> int:
@@ -118,9 +120,11 @@ class _Pass(TexelWriter):
         self.num_columns = settings.num_columns
         self.empty = settings.static.functions.empty
         self.tile_size = settings.grid.tile_size
-        self.lanes, self.scalars = Lanes(self.b, lanes_of(settings, self.vector_bytes)), Lanes(self.b, 1)
+        self.lanes = Lanes(self.b, lanes_of(settings, self.vector_bytes))
+        self.scalars = Lanes(self.b, 1)
         self.num_vectors = -(-settings.num_pixels // self.lanes.width)
-        self.reals, self.integers = self.lanes.vector(self.real), self.lanes.vector(INT)
+        self.reals = self.lanes.vector(self.real)
+        self.integers = self.lanes.vector(INT)
         order = pixel_order(self.tile_size, self.lanes.width)
         y, x = np.stack(np.divmod(order, self.tile_size)) - (self.tile_size - 1) / 2
         # Lanes past the last pixel are outside every image.
@@ -147,13 +151,13 @@ class _Pass(TexelWriter):
         """Write a loop over the tiles; yield each one's index and `rasterize.pixel.TileNumbers`. Then end the
         function."""
         b = self.b
-        given = self.arguments
+        arguments = self.arguments
         size = self.tile_size
-        with self.loop(self.long(given["first"]), self.long(given["last"])) as (tile, _):
+        with self.loop(self.long(arguments["first"]), self.long(arguments["last"])) as (tile, _):
             if self.settings.has_rays:
                 yield tile, self._tile_with_rays(tile)
             else:
-                columns = self.long(given["columns"])
+                columns = self.long(arguments["columns"])
                 place = b.srem(tile, columns), b.sdiv(tile, columns)
                 scaled = (b.fmul(b.sitofp(at, self.real), self.real(size)) for at in place)
                 yield tile, [b.fadd(corner, self.real(size / 2)) for corner in scaled]
@@ -175,7 +179,8 @@ class _Pass(TexelWriter):
         """Write a loop over a tile's list, until no pixel is live; yield each splat's id, and position in `ids`."""
         starts = self.arguments["starts"]
         b = self.b
-        first, last = (self.long(self.load(starts, b.add(tile, LONG(k)), INT)) for k in (0, 1))
+        first = self.long(self.load(starts, b.add(tile, LONG(0)), INT))
+        last = self.long(self.load(starts, b.add(tile, LONG(1)), INT))
         with self.loop(first, last) as (position, done):
             yield self.long(self.load(self.arguments["ids"], position, INT)), position
             going_on = b.append_basic_block("on")
@@ -197,8 +202,8 @@ class _Pass(TexelWriter):
         with self.all_vectors() as (k, _):
             self.store(lanes.constant(1.0, self.real), self.transmittance, k)
             if self.settings.has_rays:
-                seen = self.load(self.is_seen, k, self.reals)
-                is_live = b.fcmp_ordered(">", seen, lanes.constant(0.5, self.real))
+                is_seen = self.load(self.is_seen, k, self.reals)
+                is_live = b.fcmp_ordered(">", is_seen, lanes.constant(0.5, self.real))
             else:
                 inside = []
                 for table, center, size in zip((self.pixel_x, self.pixel_y), tile, ("width", "height"), strict=True):
@@ -211,14 +216,14 @@ class _Pass(TexelWriter):
     def load_splat(self, id_: ir.Value, tile: list[ir.Value]) -> _LoadedSplat:
         """Load a splat of the list and prepare it for a tile."""
         num_floats = self.settings.num_floats
-        given = self.arguments
-        row = self.at(given["splats"], self.times(id_, num_floats), self.real)
+        arguments = self.arguments
+        row = self.at(arguments["splats"], self.times(id_, num_floats), self.real)
         *numbers, cutoff = (self.load(row, k, self.real) for k in range(num_floats))
         planes = self.scalars.emit(self.functions.prepare, [*numbers[:9], *tile])
         limit = self.b.fadd(cutoff, self.real(CUTOFF_SLACK))
-        region_row = self.at(given["regions"], self.times(id_, 3), INT)
+        region_row = self.at(arguments["regions"], self.times(id_, 3), INT)
         region = [self.load(region_row, k, INT) for k in range(3)] if self.num_columns else []
-        texture = self.texture(given["texels"], *map(self.long, region)) if region else None
+        texture = self.texture(arguments["texels"], *map(self.long, region)) if region else None
         spread = self.spread(planes), self.spread(numbers)
         return _LoadedSplat(numbers, *spread, texture, self.spread(region), self.lanes.broadcast(limit))
 
@@ -237,8 +242,8 @@ class _Pass(TexelWriter):
             is_reached = b.and_(is_live, b.fcmp_ordered("<=", rho, splat.limit))
             with b.if_then(lanes.any(is_reached)):
                 yield _Vector(k, x, y, Place(position[0], position[1], is_reached) if position else None, is_live)
-            now = self.load(self.live, k, self.integers)
-            b.store(b.or_(now, b.load(self.any_live, typ=self.integers)), self.any_live)
+            still_live = self.load(self.live, k, self.integers)
+            b.store(b.or_(still_live, b.load(self.any_live, typ=self.integers)), self.any_live)
 
     def spread(self, numbers: Sequence[ir.Value]) -> list[ir.Value]:
         return [self.lanes.broadcast(number) for number in numbers]
@@ -275,11 +280,11 @@ class _Forward(_Pass):
         k = vector.k
         place = vector.place
         values = self.sample(splat.texture, place, has_slopes=False) if splat.texture and place else []
-        before = [self.load(channel, k, self.reals) for channel in channels]
-        state = [self.load(self.transmittance, k, self.reals), vector.is_live, *before]
+        colors = [self.load(channel, k, self.reals) for channel in channels]
+        state = [self.load(self.transmittance, k, self.reals), vector.is_live, *colors]
         at_pixel = [*splat.planes, *splat.spread, *values, vector.x, vector.y, *state]
-        after, still_live, *totals = self.lanes.emit(self.functions.forward, at_pixel)
-        self.store_state(k, after, still_live)
+        transmittance, still_live, *totals = self.lanes.emit(self.functions.forward, at_pixel)
+        self.store_state(k, transmittance, still_live)
         for total, channel in zip(totals, channels, strict=True):
             self.store(total, channel, k)
 
@@ -339,14 +344,14 @@ class _Backward(_Pass):
         k = vector.k
         place = vector.place
         sample = self.sample(splat.texture, place, has_slopes=True) if splat.texture and place else []
-        transmittance, suffix_sum, *cotangents = (
-            self.load(array, k, self.reals) for array in (self.transmittance, self.suffix_sum, *self.g)
-        )
+        transmittance = self.load(self.transmittance, k, self.reals)
+        suffix_sum = self.load(self.suffix_sum, k, self.reals)
+        cotangents = [self.load(array, k, self.reals) for array in self.g]
         at_pixel = [*splat.planes, *splat.spread, *splat.spread_region, *sample, vector.x, vector.y]
         at_pixel += [transmittance, vector.is_live, suffix_sum, *cotangents, *same_everywhere]
-        after, still_live, left, contributes, *rest = lanes.emit(self.functions.backward, at_pixel)
-        self.store_state(k, after, still_live)
-        self.store(left, self.suffix_sum, k)
+        transmittance, still_live, suffix_sum, contributes, *rest = lanes.emit(self.functions.backward, at_pixel)
+        self.store_state(k, transmittance, still_live)
+        self.store(suffix_sum, self.suffix_sum, k)
         d_values = rest[: self.num_columns]
         sums = rest[self.num_columns :]
         if self.settings.statistic:

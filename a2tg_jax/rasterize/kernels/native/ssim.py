@@ -55,30 +55,32 @@ def value_and_slopes(score: Score, x: Array, y: Array) -> tuple[Array, Array, Ar
     share = jnp.full(1, 1 / num_windows, x.dtype)
     name = _registered(score, str(x.dtype), "pull_back")
     # x² + y² and x·y are symmetric: the derivative by y is the one by x with the images and their means exchanged.
-    inputs = (x, y, d_x_mean, *d_products, share), (y, x, d_y_mean, *d_products, share)
-    d_x, d_y = (ffi.call(name, [(x.shape, x.dtype)], *given)[0] for given in inputs)
+    slope = [(x.shape, x.dtype)]
+    (d_x,) = ffi.call(name, slope, x, y, d_x_mean, *d_products, share)
+    (d_y,) = ffi.call(name, slope, y, x, d_y_mean, *d_products, share)
     return jnp.sum(sums) / num_windows, d_x, d_y
 
 
-def _registered(score: Score, dtype: str, which: Literal["score", "pull_back"]) -> str:
+def _registered(score: Score, dtype: str, name: Literal["score", "pull_back"]) -> str:
     function = getattr(score.function, "__qualname__", type(score.function).__name__)
     margin = len(score.taps) - 1
 
     def make_handler() -> ffi.Handler:
-        run = _compiled(score, dtype)[which]
+        run = _compiled(score, dtype)[name]
 
         def handler(arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
             count, height, width = arguments[0].shape
-            if which == "score":
+            if name == "score":
                 num_rows = len(results[0])
                 # `pull_back` reads T rows of windows for each row of pixels, also at the edges.
-                results[1][:, :, :margin], results[1][:, :, -margin:] = 0, 0
+                results[1][:, :, :margin] = 0
+                results[1][:, :, -margin:] = 0
             else:
                 num_rows = count * height
 
             def part(first: int, last: int, _: int) -> None:
                 # Four means of a row; or three rows of windows, between margins that stay zero.
-                rows = np.zeros(4 * width if which == "score" else 3 * (width + margin), dtype)
+                rows = np.zeros(4 * width if name == "score" else 3 * (width + margin), dtype)
                 pointers = (array.ctypes.data for array in (*arguments, *results, rows))
                 run(*pointers, first, last, count, height, width)
 
@@ -87,7 +89,7 @@ def _registered(score: Score, dtype: str, which: Literal["score", "pull_back"]) 
 
         return handler
 
-    return ffi.registered(f"ssim {which} {dtype} {function} {score.taps}", (which, dtype, score), make_handler)
+    return ffi.registered(f"ssim {name} {dtype} {function} {score.taps}", (name, dtype, score), make_handler)
 
 
 class _ImageRows(Writer):
@@ -95,11 +97,13 @@ class _ImageRows(Writer):
 
     def __init__(self, module: ir.Module, name: str, buffers: Sequence[str], score: Score, dtype: str):
         super().__init__(module, name, buffers, INTEGERS, dtype)
-        self.score, self.margin = score, len(score.taps) - 1
+        self.score = score
+        self.margin = len(score.taps) - 1
         self.lanes = Lanes(self.b, llvm_code.num_lanes(dtype))
         self.reals = self.lanes.vector(self.real)
         self.channels, self.height, self.width = (self.long(self.arguments[name]) for name in INTEGERS[2:])
-        self.down, self.across = (self.b.sub(size, LONG(self.margin)) for size in (self.height, self.width))
+        self.down = self.b.sub(self.height, LONG(self.margin))
+        self.across = self.b.sub(self.width, LONG(self.margin))
 
     def loop_over_rows(self) -> contextlib.AbstractContextManager[tuple[ir.Value, ir.Block]]:
         return self.loop(self.long(self.arguments["first"]), self.long(self.arguments["last"]))
@@ -167,7 +171,8 @@ class _ScoreRows(_ImageRows):
     def store_columns(self, means: Sequence[ir.Value], first: ir.Value) -> None:
         """Store each column's weighted sums of x, y, x² + y² and x·y over the rows of a window, from `first` on."""
         with self.vectors(self.width) as (start, _):
-            xs, ys = (self.along(self.row(name, first, self.width), start, self.width) for name in "xy")
+            xs = self.along(self.row("x", first, self.width), start, self.width)
+            ys = self.along(self.row("y", first, self.width), start, self.width)
             squares = [self.sum(self.product(p, p), self.product(q, q)) for p, q in zip(xs, ys, strict=True)]
             products = list(map(self.product, xs, ys))
             for mean, numbers in zip(means, (xs, ys, squares, products), strict=True):
@@ -180,7 +185,9 @@ class _PullBackRows(_ImageRows):
         taps = self.score.taps[::-1]
         length = b.add(self.width, LONG(self.margin))
         rows = [self.row("rows", LONG(k), length) for k in range(3)]
-        two, share = map(self.lanes.broadcast, (self.real(2.0), self.load(self.arguments["share"], 0, self.real)))
+        share = self.load(self.arguments["share"], 0, self.real)
+        two = self.lanes.broadcast(self.real(2.0))
+        share = self.lanes.broadcast(share)
         with self.loop_over_rows() as (index, _):
             channel = b.sdiv(index, self.height)
             y = b.srem(index, self.height)
@@ -191,7 +198,8 @@ class _PullBackRows(_ImageRows):
                     self.put(self.weighed(column, taps), row, b.add(start, LONG(self.margin)))
             with self.vectors(self.width) as (start, _):
                 d_mean, d_squares, d_product = (self.weighed(self.along(row, start, LONG(1)), taps) for row in rows)
-                x, y = (self.along(self.row(name, index, self.width), start, LONG(1), num=1)[0] for name in "xy")
+                (x,) = self.along(self.row("x", index, self.width), start, LONG(1), num=1)
+                (y,) = self.along(self.row("y", index, self.width), start, LONG(1), num=1)
                 # d(x² + y²)/dx = 2x and d(x·y)/dx = y.
                 by_x = self.sum(self.product(self.product(two, x), d_squares), self.product(y, d_product))
                 self.put(self.product(share, self.sum(d_mean, by_x)), self.row("d_x", index, self.width), start)

@@ -70,11 +70,13 @@ class TexelWriter(Writer):
         """Return C interpolated values and, with slopes, their C derivatives along x and C along y."""
         count = self.num_columns
         num_slopes = count if has_slopes else 0
-        values, along_x, along_y = (self.zeros(num) for num in (count, num_slopes, num_slopes))
+        values = self.zeros(count)
+        along_x = self.zeros(num_slopes)
+        along_y = self.zeros(num_slopes)
         for width in self.cases(texture):
             if width == EMPTY:
-                for none, value in zip(self.empty, values, strict=True):
-                    self.b.store(self.lanes.constant(none, self.real), value)
+                for number, value in zip(self.empty, values, strict=True):
+                    self.b.store(self.lanes.constant(number, self.real), value)
                 continue
             for row in self.rows(texture, width, place, has_slopes):
                 # Bilinear weights are products: a row is summed by the columns' weights, and weighed once.
@@ -230,8 +232,8 @@ class TexelWriter(Writer):
         if weight is None:
             return
         for total, number in zip(totals, numbers, strict=True):
-            before = self.b.load(total, typ=self.reals)
-            self.b.store(self.sum(before, self.product(weight, number)), total)
+            sum_so_far = self.b.load(total, typ=self.reals)
+            self.b.store(self.sum(sum_so_far, self.product(weight, number)), total)
 
     def zeros(self, num: int) -> list[ir.Value]:
         """Return variables of one vector each, set to zero at this point."""
@@ -245,8 +247,10 @@ class TexelWriter(Writer):
 
     def transpose_quarters(self, vectors: Sequence[ir.Value]) -> list[ir.Value]:
         """Transpose every four lanes of four vectors as a 4×4 matrix: in pairs, then in pairs of pairs."""
-        low01, low23 = (self.shuffle(vectors[k], vectors[k + 1], (0, "0", 1, "1")) for k in (0, 2))
-        high01, high23 = (self.shuffle(vectors[k], vectors[k + 1], (2, "2", 3, "3")) for k in (0, 2))
+        low01 = self.shuffle(vectors[0], vectors[1], (0, "0", 1, "1"))
+        low23 = self.shuffle(vectors[2], vectors[3], (0, "0", 1, "1"))
+        high01 = self.shuffle(vectors[0], vectors[1], (2, "2", 3, "3"))
+        high23 = self.shuffle(vectors[2], vectors[3], (2, "2", 3, "3"))
         first = (0, 1, "0", "1")
         second = (2, 3, "2", "3")
         pairs = (low01, low23, first), (low01, low23, second), (high01, high23, first), (high01, high23, second)
