@@ -36,7 +36,7 @@ def repeating_command(run: RunFolder) -> str:
 
 
 def resuming_command(run: RunFolder, devices: Devices | None = None) -> str:
-    """Return the command that continues a training on these devices; None: as its newest checkpoint was made."""
+    """Return the command that continues a training on these devices; None: the devices of its newest checkpoint."""
     if devices is None:
         devices = _devices_of_newest_checkpoint(run)
     words = ["a2tg", "train", "--out", str(run.path), "--resume"]
