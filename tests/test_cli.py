@@ -351,7 +351,6 @@ def test_run_folder_is_complete(run):
     assert metrics["gains_db"] == pytest.approx({"gaussians-2d-mcmc-continued": gain})
     for name in ("curves", "sizes", "resolutions", "textures", "depth", "normals"):
         assert (run.figures / f"{name}.png").is_file()
-    assert (run.figures / "flight.webp").is_file()
     assert len(list(run.test.glob("*.png"))) == main["test"]["views"]
     assert load_ply(run.point_cloud).num == 60
     assert "http" not in run.report.read_text(encoding="utf-8").replace("http-equiv", "")

@@ -4,7 +4,6 @@ They use matplotlib's object interface, without windows or global state.
 """
 
 import dataclasses
-import io
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,19 +15,17 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from PIL import Image
 
-from a2tg_jax.core.camera_paths import smooth_path, without_outlying
-from a2tg_jax.core.cameras import Camera, resize_camera
+from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.data.colmap import read_cameras_and_points
-from a2tg_jax.host.atomic import replacing, write_whole
+from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.text import PROGRAM
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.folder import RunFolder
-from a2tg_jax.results.images import checkered, save_animation, save_picture, to_uint8
+from a2tg_jax.results.images import checkered, save_picture, to_uint8
 from a2tg_jax.texture import texture_arrays
 from a2tg_jax.training import History
 
@@ -57,10 +54,6 @@ DEPTH_STOPS = 5
 """Number of depths in the legend."""
 NUM_CHECKERS = 60
 """Squares across a picture's empty parts."""
-FLIGHT_FRAMES = 60
-FLIGHT_PER_SECOND = 15
-FLIGHT_SIDE = 480
-"""Longer side of the flight's frames, in pixels."""
 MOST_CLOUD_POINTS = 20_000
 """Largest number of points drawn."""
 WIDEST = 3.0
@@ -88,19 +81,17 @@ def write_figures(
     report. `starts` has the number of iterations before each stage."""
 
     def written(
-        name: str, content: Figure | np.ndarray | bytes, caption: str, kind: str = "",
+        name: str, content: Figure | np.ndarray, caption: str, kind: str = "",
         legend: Sequence[tuple[str, str]] = (),
     ) -> ReportFigure:  # fmt: skip
         path = run.own(run.figures / name)
         if isinstance(content, Figure):
             save_figure(path, content)
-        elif isinstance(content, bytes):
-            write_whole(path, content)
         else:
             save_picture(path, content)
         return ReportFigure(path, caption, kind, legend)
 
-    figures: dict[str, list[ReportFigure]] = {"curves": [], "textures": [], "maps": [], "geometry": [], "flight": []}
+    figures: dict[str, list[ReportFigure]] = {"curves": [], "textures": [], "maps": [], "geometry": []}
     caption = "Loss and PSNR of the training views seen, with running means."
     figures["curves"].append(written("curves.png", curves_figure(histories, starts), caption, "chart"))
     if model.textures is not None and (model.textures.sizes.prod(axis=1) > 1).any():
@@ -122,9 +113,6 @@ def write_figures(
     figures["geometry"].append(written("depth.png", picture, f"{caption}; {NOT_HIT}.", legend=legend))
     caption = f"Normals: red to the right, green up, blue to the camera; {NOT_HIT}."
     figures["geometry"].append(written("normals.png", normal_picture(output, camera), caption))
-    animation = flight(model, settings)
-    if animation is not None:
-        figures["flight"].append(written("flight.webp", animation, "A flight past the cameras.", "figure"))
     return figures
 
 
@@ -304,25 +292,6 @@ def _on_hit(colors: np.ndarray, is_hit: np.ndarray) -> np.ndarray:
 
 def _ground(shape: tuple[int, ...]) -> np.ndarray:
     return checkered(shape, max(1, shape[1] // NUM_CHECKERS))
-
-
-def flight(model: Model, settings: RenderSettings) -> bytes | None:
-    """Return a small animation (WebP) of a smooth flight past the model's cameras; None with fewer than two."""
-    cameras = [] if model.origin is None else list(model.origin.cameras)
-    if len(cameras) < 2:
-        return None
-    path = []
-    for camera in smooth_path(without_outlying(cameras), FLIGHT_FRAMES):
-        scale = min(1.0, FLIGHT_SIDE / max(camera.width, camera.height))
-        width = max(1, round(scale * camera.width))
-        height = max(1, round(scale * camera.height))
-        path.append(resize_camera(camera, width, height))
-    # Capacity is planned from some of the cameras, and grows if another needs more.
-    renderer = Renderer(model, cameras=path[::10], settings=settings, has_geometry=False)
-    buffer = io.BytesIO()
-    pictures = (Image.fromarray(to_uint8(renderer(camera).color)) for camera in path)
-    save_animation(buffer, pictures, FLIGHT_PER_SECOND, quality=75, method=2)
-    return buffer.getvalue()
 
 
 # Cameras of a scene

@@ -11,7 +11,7 @@
       tensorboard/events.*       the same for TensorBoard, with --tensorboard
       metrics.json, per_view.json
       test/NAME.png              photograph, renders and error side by side
-      figures/                   curves, texture resolutions, some textures, depth, normals, a flight
+      figures/                   curves, texture resolutions, some textures, depth, normals
       point_cloud.ply            the Gaussians, upright, for other programs
       viewer.html                the model in a browser, on one page
       report.html                everything on one page
