@@ -93,11 +93,11 @@ def with_rows_of_views_divided(mesh: Mesh | None, gradients: T) -> T:
 
 
 def whole(tree: T) -> T:
-    """Return arrays as NumPy's, whole in each process."""
+    """Return copies of arrays as NumPy's, whole in each process."""
 
     def read(x: Any) -> np.ndarray:
         is_here = not isinstance(x, jax.Array) or x.is_fully_addressable or x.is_fully_replicated
-        return np.asarray(x if is_here else multihost_utils.process_allgather(x, tiled=True))
+        return np.array(x if is_here else multihost_utils.process_allgather(x, tiled=True))
 
     return jax.tree.map(read, tree)
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import jax
+from jax.experimental import multihost_utils
 
 from a2tg_jax.host.text import shortened
 from a2tg_jax.parallel import leave
@@ -64,9 +65,13 @@ def joined(place: ProcessPlace | None, advice: Callable[[], str]) -> Iterator[No
         reason = "no Slurm, Open MPI or Kubernetes was found: give HOST:PORT" if is_alone else error
         raise ValueError(f"--coordinator {place.coordinator}: {reason}") from error
     try:
+        # The connections that collectives use are made at the first one, which waits for some seconds only.
+        multihost_utils.sync_global_devices("joined")
         yield
         leave()
     except Exception as error:
+        if not jax.distributed.is_initialized():
+            raise  # The others have left.
         if not is_lost(error):
             # Before JAX's own function at the exit of Python, which would wait for the others and then abort.
             atexit.register(_exit, 2 if isinstance(error, ValueError | OSError) else 1)
