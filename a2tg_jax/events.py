@@ -151,8 +151,8 @@ class Event(NamedFields):
     """
 
     limited_by: ClassVar[str] = ""
-    """Field that bounds the number of Gaussians, such as "cap"; training starts from at most as many, and advice names
-    it."""
+    """Field that bounds the number of Gaussians, such as "cap": training starts from at most that many, and messages
+    name it."""
 
     def check_options(self) -> None:
         """Check the ranges of the fields (host). A stage calls it, and a system whose option the event is.

@@ -344,7 +344,8 @@ class Mcmc(StepEvent):
         return self.cap or None
 
     def num_rows(self, num: int, num_iterations: int) -> int:
-        """Return the cap, or, if growth reaches less than half of it, what it reaches, rounded up to few shapes."""
+        """Return the cap, or the number that growth reaches, rounded up so that few shapes occur, if it is less than
+        half of the cap."""
         num = self.grown(num, num_iterations)
         return max(num, self.cap if 2 * num >= self.cap else bucket_capacity(num))
 

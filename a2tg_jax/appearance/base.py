@@ -76,7 +76,7 @@ class Appearance(NamedFields):
     """Whether the low-pass filter of 2DGS shows splats that are edge-on or smaller than a pixel. Without it, ρ is
     u² + v² at the hit of the pixel's ray, and a splat without a hit is invisible."""
     num_colors = 3
-    """Number D of colours of a splat: red, green and blue, or as many features."""
+    """Number D of colours of a splat: red, green and blue, or other features."""
     empty: ClassVar[tuple[float, ...]] = ()
     """C values of a splat without a texture, whose region has no texels; () if all splats have one."""
     replaced_floats = 0
@@ -142,7 +142,7 @@ class Appearance(NamedFields):
     def shade(self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array) -> Shading:
         """Return colour residual and alpha factor at (u, v), from the K numbers and the C values of the texture.
 
-        A third result, if there is one, is the tint: D factors of the splat's own colours, or None.
+        An optional third result is the tint: D factors of the splat's own colours, or None.
         """
         return (None, None) if self.texture is None else self.texture.shade(values, u, v)
 

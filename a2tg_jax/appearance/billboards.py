@@ -135,7 +135,7 @@ class Billboards(Appearance):
         return gaussians, self._with_alpha(lambda alpha: alpha * fading[:, None, None])
 
     def share(self, gaussians: Gaussians, num_shares: Array) -> tuple[Gaussians, "Billboards"]:
-        """Return texels such that n coincident pictures are as opaque as one was; scales stay unchanged."""
+        """Fade pictures so that n coincident copies are together as opaque as one was; scales stay unchanged."""
         (bucket,) = self._bucket()
         # One share leaves the rows of padding unchanged.
         num_shares = jnp.pad(num_shares, (0, bucket.shape[0] - gaussians.num), constant_values=1)

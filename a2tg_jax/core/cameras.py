@@ -23,8 +23,10 @@ from a2tg_jax.core.pytree import pytree, static
 
 LONGEST_SIDE = 100_000
 """Largest longer side of an image, in pixels."""
-SHORTEST_FOCAL, LONGEST_FOCAL = 1e-3, 1e5
-"""Limits of focal lengths, in units of the longer side: angles of view of 179.9° and 2 arc seconds."""
+SHORTEST_FOCAL = 1e-3
+"""Least focal length, in units of the longer side: an angle of view of 179.9°."""
+LONGEST_FOCAL = 1e5
+"""Largest focal length, in units of the longer side: 2 arc seconds."""
 LARGEST_OFFSET = 100.0
 """Largest distance of the principal point from the image's corner, in units of the longer side."""
 MAX_SKEW = 1e-2

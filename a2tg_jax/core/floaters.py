@@ -40,7 +40,7 @@ def floater_scores(
     """
     means = np.asarray(means, np.float64)
     few = slice(None, None, -(-len(viewmats) // MOST_CAMERAS) or 1)
-    # A tree does not divide copies at one place, and would compare each with all; nor are they company.
+    # Copies at one place count once: they are not neighbours, and a k-d tree would compare each with all of them.
     places, first, place_of = np.unique(means, axis=0, return_index=True, return_inverse=True)
     if len(places) < 2:
         return np.zeros(len(means), np.uint8)

@@ -1,4 +1,4 @@
-"""Dataclasses whose constructor names the field that was meant by a misspelt one."""
+"""Dataclasses whose constructor suggests a field for a misspelt one."""
 
 import dataclasses
 import inspect
@@ -13,7 +13,7 @@ class FieldError(TypeError, ValueError):
 
 
 class NamedFields:
-    """Base of dataclasses, also of those that users derive."""
+    """Base class of dataclasses of this library, and of subclasses that users define."""
 
     # Not a wrapper of `__init__`, which each dataclass makes itself after its base could change it.
     def __new__(cls, /, *args: object, **values: object) -> Self:

@@ -26,7 +26,7 @@ Size = tuple[int, ...]
 Group = tuple[np.ndarray, np.ndarray]
 """Indices [n] of Gaussians, and their blocks [n, T₁, …, C], all of one size."""
 KNOWN_SLACK = 1.25
-"""Largest ratio of the elements of a known shape to those of the smallest shape, at which the known one is reused."""
+"""A known shape is reused if it has at most this many times the elements of the smallest shape."""
 
 
 class Shape(NamedTuple):

@@ -101,7 +101,7 @@ class CloneSplitPrune(StepEvent):
     def plan(self, now: Now, model: Model, gradients: Array) -> tuple[CloneSplitPlan, Array]:
         """Return the plan of each row, given its average gradient, and the number of Gaussians without room."""
         is_kept = _is_live(model) & ~self._is_pruned(now, model)
-        # A copy of what is pruned would be pruned as well.
+        # Copies of pruned rows would be pruned as well.
         is_wanted = is_kept & (gradients >= self.threshold)
         room = min(model.gaussians.num, self.cap) - jnp.sum(is_kept, dtype=jnp.int32)
         plan = self._planned(now, model, is_kept, is_wanted & (_ranks(gradients, is_wanted) < room))

@@ -58,7 +58,7 @@ class PlaceByError(HostEvent):
     at: tuple[float, ...] = static(default=(0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8))
     """Fractions of the stage at which Gaussians are added."""
     cap: int = static(default=500_000)
-    """Largest number of Gaussians, for which densification has allocated rows."""
+    """Largest number of Gaussians, at most the rows that densification has allocated."""
 
     def check_options(self) -> None:
         check_number("share", self.share, least=0, most=1)

@@ -29,8 +29,20 @@ from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import room_for
 
 
+class _Pruning(HostEvent):
+    """Base of events that prune at fractions `at` of a stage."""
+
+    at: tuple[float, ...]
+
+    def iterations(self, num_iterations: int) -> tuple[int, ...]:
+        return iterations_at(self.at, num_iterations, with_end=True)
+
+    def num_programs(self, num_iterations: int) -> int:
+        return 2  # Rows keep their number; tile lists grow with the Gaussians.
+
+
 @pytree
-class Prune(HostEvent):
+class Prune(_Pruning):
     """Event that prunes the Gaussians with the smallest blending weights, summed over the training views.
 
     After Mini-Splatting (Fang and Wang, 2024).
@@ -56,14 +68,8 @@ class Prune(HostEvent):
             check_number("keep", self.keep, least=LEAST_LEFT)
         self.iterations(1)  # checks `at`
 
-    def iterations(self, num_iterations: int) -> tuple[int, ...]:
-        return iterations_at(self.at, num_iterations, with_end=True)
-
     def num_after(self, num: int, num_iterations: int) -> int:
         return num if self.keep is None else min(num, self.keep)
-
-    def num_programs(self, num_iterations: int) -> int:
-        return 2  # Rows keep their number; tile lists grow with the Gaussians.
 
     def apply(self, due: Due, model: Model, moments: AdamState, state: object) -> Change:
         num = model.num
@@ -156,7 +162,7 @@ def _weights(
 
 
 @pytree
-class PruneFloaters(HostEvent):
+class PruneFloaters(_Pruning):
     """Event that prunes the Gaussians that show in too few training views, or are close to a camera.
 
     Each view can learn splats close to its own camera that no other view contradicts. It uses the cameras of the scene,
@@ -182,12 +188,6 @@ class PruneFloaters(HostEvent):
         if not self.at:
             raise ValueError("at must hold at least one fraction of the stage; got none")
         self.iterations(1)  # checks `at`
-
-    def iterations(self, num_iterations: int) -> tuple[int, ...]:
-        return iterations_at(self.at, num_iterations, with_end=True)
-
-    def num_programs(self, num_iterations: int) -> int:
-        return 2  # Rows keep their number; tile lists grow with the Gaussians.
 
     def apply(self, due: Due, model: Model, moments: AdamState, state: object) -> Change:
         num = model.num

@@ -279,7 +279,8 @@ def positional_gradient(
         first, second, last = _from_center(column, tile)
         return x * last - first, y * last - second
 
-    (k0, l0), (k1, l1) = (ray((M[0][k], M[1][k], M[2][k])) for k in range(2))
+    k0, l0 = ray((M[0][0], M[1][0], M[2][0]))
+    k1, l1 = ray((M[0][1], M[1][1], M[2][1]))
 
     def like_rho(mean: Triple) -> Array:
         """Return a number with the gradient of ρ."""

@@ -22,7 +22,7 @@ from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.tiles import TileGrid, TileLists
 
 Compositor = Literal["cuda", "native", "xla", "autodiff"]
-"""CUDA kernels (NVIDIA GPUs), native loops (CPUs), XLA (everywhere), or XLA without a gradient of its own."""
+"""CUDA kernels (NVIDIA GPUs), native loops (CPUs), XLA (everywhere), or XLA code that JAX differentiates."""
 Wanted = Literal["auto", "cuda", "native", "xla", "autodiff"]
 """A compositor, or the first of native loops, CUDA kernels and XLA that runs on the platform that JAX compiles for."""
 
@@ -213,7 +213,10 @@ def pack_inputs(settings: PassSettings, inputs: PassInputs) -> tuple[Array, ...]
     dtype = splats.M.dtype
     num = splats.M.shape[0]
     capacity = lists.ids.shape[0]
-    packed = pack_splats(splats, settings.has_geometry, cutoff).astype(dtype)
+    # One row per splat, in the order of `rasterize.pixel.Splat`.
+    columns = [splats.M.reshape(-1, 9), splats.opacities[:, None], splats.colors]
+    columns += [splats.normals] if settings.has_geometry else []
+    packed = jnp.concatenate([*columns, splats.numbers, cutoff[:, None]], axis=1).astype(dtype)
     size = jnp.asarray([settings.grid.columns, settings.grid.width, settings.grid.height], jnp.int32)
     # Threads divide the tiles by their starts, which must ascend. Without splats no id is valid: all lists are empty.
     starts = jax.lax.cummax(jnp.clip(lists.starts, 0, capacity if num else 0))
@@ -223,31 +226,22 @@ def pack_inputs(settings: PassSettings, inputs: PassInputs) -> tuple[Array, ...]
     return ids, starts, packed, places, texels.astype(dtype), size
 
 
-def pack_splats(splats: Splats, has_geometry: bool, *more: Array) -> Array:
-    """Pack splats as [N, S], one per row in the order of `rasterize.pixel.Splat`, followed by further columns [N]."""
-    columns = [splats.M.reshape(-1, 9), splats.opacities[:, None], splats.colors]
-    columns += [splats.normals] if has_geometry else []
-    return jnp.concatenate([*columns, splats.numbers, *(column[:, None] for column in more)], axis=1)
-
-
-def unpack_splats(packed: Array, like: Splats, has_geometry: bool) -> Splats:
-    """Unpack cotangents [N, S] as cotangents of splats."""
-    normal = 10 + like.colors.shape[1]
-    first = normal + 3 * has_geometry
-    return Splats(
-        M=packed[:, :9].reshape(-1, 3, 3).astype(like.M.dtype),
-        opacities=packed[:, 9].astype(like.opacities.dtype),
-        colors=packed[:, 10:normal].astype(like.colors.dtype),
-        normals=packed[:, normal:first].astype(like.normals.dtype) if has_geometry else jnp.zeros_like(like.normals),
-        numbers=packed[:, first : first + like.numbers.shape[1]].astype(like.numbers.dtype),
-    )
-
-
 def unpack_gradients(
     settings: PassSettings, gradients: Sequence[Array], inputs: PassInputs, probe: Array
 ) -> tuple[Splats, Array, Array]:
     """Unpack a kernel's gradients, of `PassSettings.gradient_shapes`, as gradients of splats, texels and probe."""
     packed, d_texels, d_probe = gradients
-    d_splats = unpack_splats(packed, inputs.splats, settings.has_geometry)
+    splats = inputs.splats
+    normal = 10 + settings.num_colors
+    first = normal + 3 * settings.has_geometry
+    d_splats = Splats(
+        M=packed[:, :9].reshape(-1, 3, 3).astype(splats.M.dtype),
+        opacities=packed[:, 9].astype(splats.opacities.dtype),
+        colors=packed[:, 10:normal].astype(splats.colors.dtype),
+        normals=packed[:, normal:first].astype(splats.normals.dtype)
+        if settings.has_geometry
+        else jnp.zeros_like(splats.normals),
+        numbers=packed[:, first : first + settings.num_own_numbers].astype(splats.numbers.dtype),
+    )
     d_probe = d_probe.astype(probe.dtype) if settings.statistic else jnp.zeros_like(probe)
     return d_splats, d_texels.astype(inputs.texels.dtype), d_probe

@@ -142,7 +142,7 @@ def tile_lists(
     depths = M[:, 2, 2]
     order = jnp.argsort(depths, stable=True)
     unordered = tile_rectangles(bounds, grid, pixels)
-    # Of counts that are not in order: a GPU would sum and gather in one slow kernel.
+    # Summed before they are ordered: a GPU would otherwise sum and gather in one slow kernel.
     total = total_pairs(unordered.counts)
     rectangles = jax.tree.map(lambda x: x[order], unordered)
     # The total is known to a relative error of about 2⁻²⁰.

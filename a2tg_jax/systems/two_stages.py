@@ -68,7 +68,8 @@ class TwoStages(System):
         length = self.stage1_iterations
         if floaters.min_views or floaters.near:
             growing = [event for event in events if isinstance(event, StepEvent) and event.most_gaussians is not None]
-            growths = [times for times in (event.times(length) for event in growing) if times.num_times]
+            growths = [event.times(length) for event in growing]
+            growths = [times for times in growths if times.num_times]
             if growths:
                 last = max(growths, key=lambda times: times.last_time)
                 floaters = dataclasses.replace(floaters, at=during_growth(floaters.at, length, last))
@@ -134,7 +135,7 @@ class Kernels(NamedTuple):
 
 
 def kernels_of(rate: float | None, exponents: LimitExponents) -> Kernels:
-    """Return what kernels add that are trained at a rate; 0 or None: they are Gaussians."""
+    """Return what kernels whose shapes learn at a rate add; 0 or None: all kernels are Gaussians."""
     if not rate:
         return Kernels(None, {}, ())
     return Kernels(Exponents(), {"exponents": rate}, (exponents,) if exponents.least else ())

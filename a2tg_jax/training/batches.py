@@ -51,7 +51,7 @@ class Photographs(NamedTuple):
     """[H, W, 2] rays of the lens (`Camera.rays`); None of a pinhole."""
 
     def of(self, views: Array | np.ndarray | None, dtype: np.dtype | None = None) -> "Photographs":
-        """Return the views of some indices, or all; with a dtype, cameras and depths are of it."""
+        """Return the views of some indices, or all; with a dtype, cameras and depths are converted to it."""
         batch = self
         if views is not None:
             # Rays are of the lens and have no axis of views.
@@ -182,8 +182,8 @@ class PhotoStore:
         self.is_resident = not any_process(mesh, not plan.is_resident)
 
     def batch(self, iteration: int) -> tuple[Photographs, Array | np.ndarray | None]:
-        """Return photographs of one kind that include the iteration's, and the int32 indices of these; None if all
-        are.
+        """Return photographs of one kind, and the int32 indices of the iteration's among them; None if all are the
+        iteration's.
 
         Raises:
           ValueError, OSError: if a photograph that was not copied has gone, has changed or cannot be read.

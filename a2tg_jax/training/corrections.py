@@ -230,7 +230,7 @@ def updated(
     correction: Correction, state: CorrectionState, views: Array, grads: Array, progress: Array
 ) -> CorrectionState:
     """Return the state after a step of Adam on the rows of the views [B] of a batch, in which a view may occur twice.
-    The gradients [B, ...] are those of each view's loss in its row."""
+    The gradients [B, ...] are of each view's loss in its row."""
     # A view that occurs twice gets the sum of its gradients.
     sums = jnp.zeros_like(state.rows).at[views].add(grads)
     is_seen = jnp.zeros(len(state.rows), bool).at[views].set(True)

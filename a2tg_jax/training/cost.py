@@ -24,15 +24,24 @@ MB = 10**6
 PROCESS = 300 * MB
 """Python, JAX and other imports."""
 # Rounded to fit the runs in experiments/NOTEBOOK.md, "Forecasts of memory".
-FIRST_PROGRAM, FURTHER_STAGE, FURTHER_PROGRAM = 270 * MB, 110 * MB, 25 * MB
-"""Memory of compiled programs: of the first stage, of each further one, and of each program of new shapes."""
+FIRST_PROGRAM = 270 * MB
+"""Memory of the compiled programs of the first stage."""
+FURTHER_STAGE = 110 * MB
+"""Memory of the compiled programs of each further stage."""
+FURTHER_PROGRAM = 25 * MB
+"""Memory of each program of new shapes."""
 COMPILER = 240 * MB
 """Memory of the compiler during a step's compilation."""
 STATES = 3
 """Parameters and the two moments of Adam."""
-STEP_PER_MODEL, STEP_PER_ROW, STEP_PER_PIXEL, STEP_PER_PAIR = 2.9, 300, 123, 4
-"""Bytes of a step's own buffers: for each byte of the model (gradients and the new state), row (splats), pixel
-(colours, loss, and the gradients of both) and pair (tile lists)."""
+STEP_PER_MODEL = 2.9
+"""Bytes of a step's own buffers for each byte of the model: gradients and the new state."""
+STEP_PER_ROW = 300
+"""The same for each row: splats."""
+STEP_PER_PIXEL = 123
+"""The same for each pixel: colours, loss, and the gradients of both."""
+STEP_PER_PAIR = 4
+"""The same for each pair of the tile lists."""
 GEOMETRY_PER_PIXEL = 72
 """Further bytes if a term of the loss reads depth or normals."""
 STATISTIC_PER_ROW = 480
@@ -40,14 +49,18 @@ STATISTIC_PER_ROW = 480
 CORRECTION_COPIES = 8
 """Copies of the rows of a correction: what the stage began with, rows and moments before and after a step, gradients.
 """
-VIEW_PER_ROW, VIEW_PER_PIXEL = 140, 5
-"""Bytes of each view of a batch, without its gradient of the model."""
+VIEW_PER_ROW = 140
+"""Bytes of each view of a batch for each row, without its gradient of the model."""
+VIEW_PER_PIXEL = 5
+"""The same for each pixel."""
 PAIRS_PER_TILE = 90
 """Room in the tile lists of a stage that begins with few, large Gaussians."""
 DECODER_PER_PIXEL = 15
 """Bytes while a photograph is read."""
-SECONDS_PER_ROW, SECONDS_PER_PIXEL = 2.4e-6, 0.72e-6
-"""Seconds of an iteration on one core (docs/performance.md), shared by all cores."""
+SECONDS_PER_ROW = 2.4e-6
+"""Seconds of an iteration on one core (docs/performance.md) for each row; all cores share them."""
+SECONDS_PER_PIXEL = 0.72e-6
+"""The same for each pixel."""
 
 
 class Bytes(NamedTuple):

@@ -56,7 +56,7 @@ class FitResult(NamedFields):
     stages: tuple[StageResult, ...]
     """Stages that were trained; if training was resumed in a later stage, the earlier ones are missing."""
     checkpoint: Checkpoint | None = None
-    """State at the end, in the memory of the host: three times as large as the model, for `more`."""
+    """State at the end, for `more`, in the memory of the host: three times as large as the model."""
 
     def more(self, scene: Scene, iterations: int, **options: Any) -> "FitResult":
         """Continue the last stage for further iterations.
@@ -177,7 +177,7 @@ def fit(
         if start is not None:
             raise ValueError("start and resume are both given, but a checkpoint has its own model: leave out start")
         first = resume.stage
-        # Nothing is left of a finished stage that the next one continues.
+        # A finished stage is not resumed if the next one continues it.
         if first + 1 < len(stages) and stages[first + 1].continues and resume.is_at_end:
             first += 1
         check_resume(resume, system, first)

@@ -55,7 +55,7 @@ LAUNCHED = 10
 """Number of steps between two waits for the device; fewer if their photographs take too much memory."""
 LOG_EVERY = 10
 WORTH_COMPILING = 1_000
-"""Iterations for which a step without statistics that nothing reads any more is worth its compilation."""
+"""Remaining iterations for which it is worth compiling a step without statistics that nothing reads any more."""
 PLANNED_VIEWS = 64
 """Largest number of views that room is planned for."""
 GROWTH_ROOM = 1.5
@@ -381,8 +381,8 @@ class StageRun:
         return self.views[self.order.indices(iteration)[0]].picture.size
 
     def render_settings(self, size: Size) -> RenderSettings:
-        """Return settings with room for the views of a size, planned before the first of them for a sample of the views
-        and for all rows of the model to exist."""
+        """Return settings with a capacity for the views of a size. The first call plans it, for a sample of these views
+        and for a model that uses all its rows."""
         settings = RenderSettings(tile_size=self.system.tile_size)
         model = self.state.model
         if size not in self.capacities:
@@ -470,17 +470,13 @@ class StageRun:
                 change = checked_change(change)
             self.effects.apply(place, self.state, change)
             self.state = dataclasses.replace(self.state, model=change.model, moments=change.moments)
-            if change.rows is not None:
-                self._move_rows(change.rows)
+            if change.rows is not None:  # Statistics of other events move along with the Gaussians.
+                pairs = zip(self.stage.events, self.state.events, strict=True)
+                states = (None if state is None else other.gather(state, change.rows) for other, state in pairs)
+                self.state = dataclasses.replace(self.state, events=tuple(states))
             is_dropped = iteration == due[-1] and event.observes and self._is_worth_dropping(iteration)
             self._keep(place, None if is_dropped else change.state)
         self.state = divided(self.mesh, self.state)
-
-    def _move_rows(self, rows: np.ndarray) -> None:
-        """Move the events' statistics along with the Gaussians."""
-        pairs = zip(self.stage.events, self.state.events, strict=True)
-        events = tuple(None if state is None else event.gather(state, rows) for event, state in pairs)
-        self.state = dataclasses.replace(self.state, events=events)
 
     def _keep(self, place: int, state: object) -> None:
         """Replace the state of the event at a place."""

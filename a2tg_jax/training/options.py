@@ -438,7 +438,7 @@ def like(kind: Any, other: object) -> Any:
 
 
 def own_options(system: object, other: object) -> dict[str, Any]:
-    """Return the options of a system, or of a group of options, that another lacks or has otherwise, nested as in a
+    """Return the options of a system, or of a group, that another one lacks or has with another value, nested as in a
     configuration file."""
     hints = typing.get_type_hints(type(system))
     other_hints = typing.get_type_hints(type(other))

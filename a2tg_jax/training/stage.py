@@ -117,8 +117,8 @@ class Stage(NamedFields):
     cools_down: bool = static(default=False)
     """Whether all learning rates also fall linearly over the stage, to a tenth at its end."""
     continues: bool = static(default=False)
-    """Whether this is the stage before for further iterations: it begins with that one's last state, Adam's moments
-    included, and all schedules, such as learning rates, stay at their end."""
+    """Whether this stage continues the one before: it begins with its last state, Adam's moments included, and all
+    schedules, such as learning rates, stay at their end."""
 
     @property
     def statistic(self) -> Statistic | None:
@@ -260,15 +260,18 @@ class Stage(NamedFields):
 
     def clock(self) -> "Clock":
         """Return the schedule for the step (host)."""
-        times = (event.times(self.iterations) if isinstance(event, StepEvent) else None for event in self.events)
+        times: list[Times | None] = []
+        for event in self.events:
+            of_event = event.times(self.iterations) if isinstance(event, StepEvent) else None
+            # An event of every iteration needs no condition in the step.
+            times.append(None if of_event == EVERY_ITERATION else of_event)
         return Clock(
             num_iterations=self.iterations,
             done=self.iterations if self.continues else 0,
             per_iteration=1.0 / self.iterations,
             log_decay=math.log(self.rates.means_final_factor),
             sh_interval=max(1, round(self.iterations / 30)),  # 1,000 of 30,000 iterations in 3DGS
-            # An event of every iteration needs no condition in the step.
-            times=tuple(None if times == EVERY_ITERATION else times for times in times),
+            times=tuple(times),
         )
 
 

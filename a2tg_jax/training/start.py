@@ -70,7 +70,7 @@ def start_colors(scene: Scene) -> np.ndarray:
 def wider_where_dense(gaussians: Gaussians, cameras: Sequence[Camera]) -> Gaussians:
     """Widen Gaussians to a standard deviation of a pixel at least, from the camera where they are largest (host).
 
-    Without a low-pass filter, a smaller splat shows only if it covers a pixel's centre, and hardly overlaps others.
+    Without a low-pass filter, a smaller splat shows only if it covers a pixel's centre, and rarely overlaps others.
     Gaussians that no camera sees stay unchanged.
     """
     pixels = _largest_sizes(gaussians, cameras)

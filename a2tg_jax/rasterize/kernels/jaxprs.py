@@ -54,7 +54,7 @@ def trace(function: Callable[..., object], *examples: object) -> tuple[core.Clos
 
 
 def in_clean_context(work: Callable[[], object]) -> Any:
-    """Return work(), run on a thread of its own, because JAX's tracing is per thread, with the caller's dtype rules."""
+    """Return work(), called on a new thread, where JAX traces nothing else, with the caller's dtype rules."""
     config: Any = jax.config
     is_x64 = config.jax_enable_x64
     promotion = config.jax_numpy_dtype_promotion

@@ -152,8 +152,7 @@ class _TracedPass:
         indices = jnp.arange(self.num_groups, dtype=jnp.int32)
         images: Any = jax.lax.map(jax.checkpoint(group) if self.in_any_mode else group, indices)
         # Without the tiles that fill up the last group.
-        channels, transmittance = (x.reshape(-1, *x.shape[2:])[: self.grid.num] for x in images)
-        return channels, transmittance
+        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: self.grid.num], images)
 
     def tiles_of_group(self, index: Array) -> tuple[Tiles, Array]:
         """Return the tiles of a group, and the starts of their lists [G]; tiles past the last one have empty lists."""

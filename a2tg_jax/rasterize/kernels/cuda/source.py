@@ -1,7 +1,7 @@
 """Source text of the GPU kernels of one kind of pass: constants, a dialect, the functions of a pixel, and tiles.c.
 
-The functions are scalar JAX functions, printed as C in the dialect that CUDA C++ and OpenCL C share. A function is
-traced once to a jaxpr; what it computes, and its derivative, is said once, in JAX. Each primitive becomes a line.
+The functions are scalar JAX functions, printed as C in the dialect that CUDA C++ and OpenCL C share. A function, and
+its derivative, is defined once, in JAX, and traced once to a jaxpr. Each primitive becomes a line.
 Native loops (`native.lanes`) translate the same primitives, plus a few of their own formulas.
 
 Operands are names of variables or literals. Flags are `int`, 0 or 1. Integers behave as XLA's: x / 0 = −1. Functions
@@ -61,8 +61,8 @@ def source(kernel: PassSettings, dialect: Dialect) -> str:
     functions = PixelFunctions(kernel)
     tile_size = kernel.grid.tile_size
     num_numbers = kernel.num_floats - 1
-    # Sums of a splat over pixels: its planes replace the nine numbers of M, and the statistic has three. In NUM_SUMS,
-    # they are followed by the number of pixels and, for textures of one texel, that texel.
+    # Sums of a splat over pixels: its planes replace the nine numbers of M, and the statistic has three. NUM_SUMS also
+    # counts the number of pixels and, for textures of one texel, that texel.
     count = functions.num_planes + num_numbers - 9 + (3 if kernel.statistic else 0)
     constants: dict[str, Any] = {
         "TILE_SIZE": tile_size,

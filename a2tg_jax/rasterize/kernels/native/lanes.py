@@ -145,10 +145,11 @@ class Lanes:
         for zero, other in ((x, y), (y, x)):
             if _orders_by_compare(zero, 1.0):
                 return self.builder.fadd(self.larger(zero, other), zero)
-        # If `larger` gives the same in both orders, that is right. Otherwise there is a NaN, or zeros of both signs, and
-        # the result is the union of the bits, with the signs intersected.
+        # What `larger` gives in both orders is right. If they differ, there is a NaN, or zeros of both signs, and the
+        # result is the union of the bits, with the signs intersected.
         b = self.builder
-        sign = self._sign_bits(x.type)
+        width = num_bits(x.type)
+        sign = self.constant(1 << (width - 1), ir.IntType(width))
         x_first = b.xor(self._as_bits(self.larger(x, y)), sign)
         y_first = b.xor(self._as_bits(self.larger(y, x)), sign)
         return b.bitcast(b.xor(b.or_(x_first, y_first), sign), x.type)
@@ -166,10 +167,6 @@ class Lanes:
 
     def _as_bits(self, x: ir.Value) -> ir.Value:
         return self.builder.bitcast(x, self.vector(ir.IntType(num_bits(x.type))))
-
-    def _sign_bits(self, type_: ir.Type) -> ir.Constant:
-        width = num_bits(type_)
-        return self.constant(1 << (width - 1), ir.IntType(width))
 
 
 def _orders_by_compare(value: ir.Value, sign_of_zero: float) -> bool:

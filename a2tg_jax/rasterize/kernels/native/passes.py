@@ -85,7 +85,8 @@ def packed_pixels(settings: PassSettings, pixels: TilePixels | None, vector_byte
     lanes = lanes_of(settings, vector_bytes)
     order = pixel_order(settings.grid.tile_size, lanes)
     numbers = jnp.concatenate([pixels.centers, pixels.frames.reshape(-1, 4)], axis=1)
-    x, y = (pixels.offsets[:, k, order] for k in range(2))
+    x = pixels.offsets[:, 0, order]
+    y = pixels.offsets[:, 1, order]
     parts = numbers, x, y, pixels.is_seen[:, order].astype(settings.dtype)
     return jnp.concatenate([jnp.pad(part, ((0, 0), (0, -part.shape[1] % lanes))) for part in parts], axis=1)
 
@@ -297,8 +298,8 @@ class _Backward(_Pass):
     def write(self) -> None:
         b = self.b
         settings = self.settings
-        num_arrays = 1 + settings.num_channels
-        self.suffix_sum, *self.g = (self.variable(self.reals, self.num_vectors) for _ in range(num_arrays))
+        self.suffix_sum = self.variable(self.reals, self.num_vectors)
+        self.g = [self.variable(self.reals, self.num_vectors) for _ in range(settings.num_channels)]
         self.sums = self.variable(self.reals, self.num_sums)
         for k in range(self.num_sums):
             self.store(self.lanes.constant(0.0, self.real), self.sums, k)
@@ -410,7 +411,8 @@ def compiled_passes(kernel: PassSettings) -> dict[str, CompiledFunction]:
     """Return the passes `forward` and `backward` of a kernel, compiled at the first call."""
     functions = PixelFunctions(kernel)
     module = ir.Module("passes")
-    forward, backward = (llvm_code.unique(name) for name in ("forward", "backward"))
+    forward = llvm_code.unique("forward")
+    backward = llvm_code.unique("backward")
     _Forward(functions, module, forward, FORWARD).write()
     _Backward(functions, module, backward, BACKWARD).write()
     signatures = {forward: (len(FORWARD), len(INTEGERS)), backward: (len(BACKWARD), len(INTEGERS))}

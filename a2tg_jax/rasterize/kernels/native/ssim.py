@@ -210,7 +210,8 @@ class _PullBackRows(_ImageRows):
 def _compiled(score: Score, dtype: str) -> dict[str, CompiledFunction]:
     """Return the functions `score` and `pull_back`, compiled at the first call."""
     module = ir.Module("windows")
-    forward, backward = (llvm_code.unique(name) for name in ("score", "pull_back"))
+    forward = llvm_code.unique("score")
+    backward = llvm_code.unique("pull_back")
     _ScoreRows(module, forward, SCORE, score, dtype).write(dtype)
     _PullBackRows(module, backward, PULL_BACK, score, dtype).write()
     signatures = {forward: (len(SCORE), len(INTEGERS)), backward: (len(PULL_BACK), len(INTEGERS))}
