@@ -118,11 +118,12 @@ def assemble_scene(
     if cloud is not None:
         cloud = _usable_points(cloud, transform, source)
     points, colors = _start(train, viewmats, cloud, transform, source, is_object)
-    views = {shot.name: _view(shot, viewmats[shot.name]) for shot in shots}
+    views = [_view(shot, viewmats[shot.name]) for shot in shots]
+    test_names = {shot.name for shot in test}
     return Scene(
         name=name,
-        train=tuple(views[key] for key in sorted(shot.name for shot in train)),
-        test=tuple(views[key] for key in sorted(shot.name for shot in test)),
+        train=tuple(view for view in views if view.name not in test_names),
+        test=tuple(view for view in views if view.name in test_names),
         points=np.asarray(points, np.float32),
         colors=colors.astype(np.float32) / np.float32(255),
         transform=transform,
@@ -176,7 +177,8 @@ def _start(
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return the points [P, 3] to start from, in the normalised world, and their colours [P, 3] uint8.
 
-    They are those of the cloud if training views see them. Warnings say if not all do, or where other points are from.
+    The cloud's points are used if training views see some. Warnings count views that see none, or say which other
+    points are used.
     """
     sights = [shot.sight(viewmats[shot.name]) for shot in train]
     lacks = "has no"

@@ -57,9 +57,13 @@ class SparseModel(NamedTuple):
 def find_models(path: Path) -> list[Path]:
     """Return the folders of sparse models in a scene folder, first the folder itself, then as COLMAP numbers them."""
     sparse = path / "sparse"
-    numbered = {folder: sorted(filter(str.isdecimal, names_in(folder)), key=int) for folder in (sparse, path)}
-    below = {folder: [folder / name for name in names] for folder, names in numbered.items()}
-    return [folder for folder in (path, *below[sparse], sparse, *below[path]) if _model_files(folder)]
+    folders = [path, *_numbered_in(sparse), sparse, *_numbered_in(path)]
+    return [folder for folder in folders if _model_files(folder)]
+
+
+def _numbered_in(folder: Path) -> list[Path]:
+    """Return the files and folders in a folder whose names are numbers, in their order."""
+    return [folder / name for name in sorted(filter(str.isdecimal, names_in(folder)), key=int)]
 
 
 def _model_of(path: Path) -> Path:
@@ -75,14 +79,15 @@ def _model_of(path: Path) -> Path:
     counts = {model: num_images(_model_files(model)["images"]) for model in models}
     # A model's own folder, if given, is the user's choice.
     chosen = path if path in models else max(models, key=lambda model: counts[model])
-    descriptions = {
-        model: f"{'/'.join(model.parts[len(path.parts) :]) or 'its own'} ({counted(counts[model], 'image')})"
-        for model in models
-    }
+
+    def described(model: Path) -> str:
+        place = model.relative_to(path).as_posix()
+        return f"{'its own' if place == '.' else place} ({counted(counts[model], 'image')})"
+
     others = [model for model in models if model != chosen]
     warnings.warn(
-        f"{path}: has {len(models)} COLMAP models; {descriptions[chosen]} is read, and not "
-        f"{', '.join(descriptions[model] for model in others)}; to read another, give its folder, such as {others[0]}",
+        f"{path}: has {len(models)} COLMAP models; {described(chosen)} is read, and not "
+        f"{', '.join(map(described, others))}; to read another, give its folder, such as {others[0]}",
         stacklevel=3,
     )
     return chosen
@@ -212,12 +217,12 @@ def _panoramas(model: SparseModel) -> dict[int, int]:
         centers = np.stack(list(places.values()))
         # The nearest of two is the centre itself.
         reach = SAME_PLACE * float(np.median(cKDTree(centers).query(centers, k=2)[0][:, 1]))
-    # A rig of one sensor has no translations and is no panorama.
-    around = {
-        rig.id
-        for rig in model.rigs
-        if rig.translations and all(place is not None and np.linalg.norm(place) <= reach for place in rig.translations)
-    }
+    around = set()
+    for rig in model.rigs:
+        offsets = [np.inf if place is None else float(np.linalg.norm(place)) for place in rig.translations]
+        # A rig of one sensor has no translations and is no panorama.
+        if offsets and np.max(offsets) <= reach:
+            around.add(rig.id)
     return {image_id: frame.id for image_id, frame in frames.items() if frame.rig_id in around}
 
 

@@ -234,7 +234,10 @@ class _Words:
         return next(self.words) == b"CAMERA"
 
 
-def _camera(source: _Bytes | _Words) -> tuple[int, ColmapCamera]:
+Source = _Bytes | _Words
+
+
+def _camera(source: Source) -> tuple[int, ColmapCamera]:
     number = source.whole()
     model = source.model()
     width = source.whole("Q")
@@ -242,17 +245,13 @@ def _camera(source: _Bytes | _Words) -> tuple[int, ColmapCamera]:
     return number, ColmapCamera(model.name, width, height, tuple(source.params(model)))
 
 
-def _image(source: _Bytes | _Words) -> ImageRecord:
+def _image(source: Source) -> ImageRecord:
     image = ImageRecord(source.whole(), source.floats(7), source.whole(), source.name())
     source.skip_features()
     return image
 
 
-def _point(source: _Bytes | _Words) -> Any:
-    return source.point()
-
-
-def _rig(source: _Bytes | _Words) -> RigRecord:
+def _rig(source: Source) -> RigRecord:
     number = source.whole()
     translations: list[list[float] | None] = []
     for index in range(source.whole()):
@@ -263,7 +262,7 @@ def _rig(source: _Bytes | _Words) -> RigRecord:
     return RigRecord(number, translations)
 
 
-def _frame(source: _Bytes | _Words) -> FrameRecord:
+def _frame(source: Source) -> FrameRecord:
     number = source.whole()
     rig = source.whole()
     source.floats(7)
@@ -277,8 +276,8 @@ def _frame(source: _Bytes | _Words) -> FrameRecord:
     return FrameRecord(number, rig, images)
 
 
-RECORDS: dict[str, Callable[[_Bytes | _Words], Any]] = {
-    "cameras": _camera, "images": _image, "points3D": _point, "rigs": _rig, "frames": _frame,
+RECORDS: dict[str, Callable[[Source], Any]] = {
+    "cameras": _camera, "images": _image, "points3D": lambda source: source.point(), "rigs": _rig, "frames": _frame,
 }  # fmt: skip
 
 

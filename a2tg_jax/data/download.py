@@ -83,7 +83,8 @@ def fetch(archive: Archive, scenes: Path, *, progress: bool = True) -> bool:
       ValueError: if the checksum differs, the archive is damaged, or it would write outside its folder.
     """
     file = scenes / "archives" / archive.url.partition("?")[0].rpartition("/")[2]
-    done, begun = (file.with_name(f"{file.name}.{state}") for state in ("unpacked", "unpacking"))
+    done = file.with_name(f"{file.name}.unpacked")
+    begun = file.with_name(f"{file.name}.unpacking")
     if done.is_file():
         return False
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -176,31 +177,51 @@ def _unpack(file: Path, folder: Path, begun: Path, progress: bool) -> None:
     `begun` is a file that is made before the first member; if it is there, files of other sizes are replaced.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    members: list[tuple[Any, str, int | None]]
     with tarfile.open(file) if tarfile.is_tarfile(file) else zipfile.ZipFile(file) as opened:
-        if isinstance(opened, tarfile.TarFile):
-            if hasattr(tarfile, "data_filter"):  # Pythons before 3.11.4 have no filters.
-                opened.extraction_filter = tarfile.data_filter
-            members = [(each, each.name, None if each.isdir() else each.size) for each in opened.getmembers()]
-        else:
-            members = [(each, each.filename, None if each.is_dir() else each.file_size) for each in opened.infolist()]
-        members = [member for member in members if LEFT_OUT not in Path(member[1]).parts]
-        for member, name, num_bytes in members:
-            if isinstance(member, tarfile.TarInfo) and not (member.isfile() or member.isdir()):
-                raise ValueError(f"{file}: the member {name!r} is a link or a device, which may lead outside {folder}")
-            target = folder / name
+        members = [member for member in _members(opened) if LEFT_OUT not in Path(member.name).parts]
+        for member in members:
+            target = folder / member.name
+            if member.is_special:
+                raise ValueError(
+                    f"{file}: the member {member.name!r} is a link or a device, which may lead outside {folder}"
+                )
             # resolve also follows links that are in the folder already.
             if not target.resolve().is_relative_to(folder.resolve()):
-                raise ValueError(f"{file}: the member {name!r} would be written outside {folder}")
-            if num_bytes is not None and not begun.is_file() and target.exists() and _size(target) != num_bytes:
+                raise ValueError(f"{file}: the member {member.name!r} would be written outside {folder}")
+            is_other = not member.is_folder and target.exists() and _size(target) != member.num_bytes
+            if is_other and not begun.is_file():
                 raise FileExistsError(
                     f"{target}: exists already and differs from the one in {file.name}; move it away, or choose "
                     "another folder"
                 )
-        _check_room(folder, sum(num_bytes or 0 for _, _, num_bytes in members), str(file))
+        _check_room(folder, sum(member.num_bytes for member in members if not member.is_folder), str(file))
         begun.touch()
-        for member, _, _ in progress_over(members, "unpacking", "file", is_shown=progress):
-            opened.extract(member, folder)
+        for member in progress_over(members, "unpacking", "file", is_shown=progress):
+            opened.extract(member.entry, folder)
+
+
+class _Member(NamedTuple):
+    """Member of an archive."""
+
+    entry: Any  # As tarfile or zipfile has it.
+    name: str
+    num_bytes: int
+    is_folder: bool
+    is_special: bool  # Neither a file nor a folder.
+
+
+def _members(opened: tarfile.TarFile | zipfile.ZipFile) -> list[_Member]:
+    members = []
+    if isinstance(opened, zipfile.ZipFile):
+        for info in opened.infolist():
+            members.append(_Member(info, info.filename, info.file_size, info.is_dir(), is_special=False))
+        return members
+    if hasattr(tarfile, "data_filter"):  # Pythons before 3.11.4 have no filters.
+        opened.extraction_filter = tarfile.data_filter
+    for entry in opened.getmembers():
+        is_special = not entry.isfile() and not entry.isdir()
+        members.append(_Member(entry, entry.name, entry.size, entry.isdir(), is_special))
+    return members
 
 
 def _check_room(folder: Path, num_bytes: int, what: str) -> None:

@@ -40,14 +40,14 @@ IMAGE_FOLDERS = ("rgb", "rgbd", ".")
 
 def polycam(path: Path) -> list[Cameras]:
     """Return the cameras of Polycam's raw data in a folder, the preferred ones first."""
-    found = []
+    cameras = []
     for base in (path / "keyframes", path):
-        for cameras, images in POLYCAM_FOLDERS:
-            folder = base / cameras
+        for name, images in POLYCAM_FOLDERS:
+            folder = base / name
             if folder.is_dir() and (base / images).is_dir() and any(folder.glob("*.json")):
-                found.append(Cameras(folder, functools.partial(_polycam_frames, folder, base / images)))
+                cameras.append(Cameras(folder, functools.partial(_polycam_frames, folder, base / images)))
                 break
-    return found
+    return cameras
 
 
 def _polycam_frames(cameras: Path, images: Path) -> Frames:
@@ -135,13 +135,13 @@ def _within_border(pixels: np.ndarray) -> np.ndarray:
 
 def record3d(path: Path) -> list[Cameras]:
     """Return the cameras of Record3D's metadata in a folder, the preferred ones first."""
-    found = []
+    cameras = []
     for name in METADATA:
         file = path / name
         # The name alone says little.
         if is_regular(file) and b'"poses"' in read_regular(file, MOST_BYTES):
-            found.append(Cameras(file, functools.partial(_record3d_frames, file)))
-    return found
+            cameras.append(Cameras(file, functools.partial(_record3d_frames, file)))
+    return cameras
 
 
 def _record3d_frames(file: Path) -> Frames:

@@ -151,7 +151,8 @@ class _Compared(NamedTuple):
 
 def _compared(looks: Sequence[Look], points: np.ndarray) -> _Compared:
     """Compare the colours of points [C, 3] in the photographs."""
-    colors, cells, is_free = (np.stack(each) for each in zip(*(look.at(points) for look in looks), strict=True))
+    seen = [look.at(points) for look in looks]
+    colors, cells, is_free = map(np.stack, zip(*seen, strict=True))
     num_seen = (~np.isnan(colors[..., 0])).sum(axis=0)
     kept = (is_free.sum(axis=0) <= max(1, MOST_SPOILT * len(looks))) & (num_seen > 0)
     points = points[kept]

@@ -267,8 +267,8 @@ def _find_files(
             return None
         return _Files(photo, image, 1 if folder in copies else downscale, mask_file, mask_downscale, depths)
 
-    found = map_in_threads(find, photos, masks)
-    missing = [photo.image for photo, files in zip(photos, found, strict=True) if files is None]
+    of_photos = map_in_threads(find, photos, masks)
+    missing = [photo.image for photo, files in zip(photos, of_photos, strict=True) if files is None]
     if missing:
         folder, name = missing[0]
         others = f", and {len(missing) - 1} more of its {len(photos)} are missing" if len(missing) > 1 else ""
@@ -276,7 +276,7 @@ def _find_files(
             f"{copies.get(folder, folder) / name}: no such image, but the scene has a camera for it{others}; put it "
             f"there, or {how_to_remove(name)}"
         )
-    return [files for files in found if files is not None]
+    return [files for files in of_photos if files is not None]
 
 
 def _full_mask(photo: Photo, downscale: int) -> tuple[Path, str] | None:
@@ -425,8 +425,9 @@ def find_depths(images: Path, name: str) -> Path | None:
     """Return the depth map of an image below a folder: NAME.npy, NAME.png, NAME.EXT.npy or NAME.EXT.png in the sibling
     folder `depths`; None if there is none.
     """
-    stems = str(Path(name).with_suffix("")), name
-    return on_disk(images.with_name(DEPTHS), *(stem + suffix for suffix in (".npy", ".png") for stem in stems))
+    stem = Path(name).with_suffix("")
+    names = (f"{stem}.npy", f"{name}.npy", f"{stem}.png", f"{name}.png")
+    return on_disk(images.with_name(DEPTHS), *names)
 
 
 def _depth_map(file: Path, lens: Lens, stored: tuple[int, int], size: tuple[int, int]) -> DepthMap:

@@ -55,13 +55,13 @@ FILM_WIDTH = 36.0
 def metashape(path: Path) -> list[Cameras]:
     """Return Metashape's cameras, an XML file or those in a folder: cameras.xml first, and then by name."""
     files = [path] if is_regular(path) else [path / name for name in names_in(path)]
-    found = []
+    cameras = []
     for file in files:
         if file.suffix.lower() == ".xml" and is_regular(file):
             with open_regular(file) as opened:
                 if b"<sensors" in opened.read(HEAD_BYTES):
-                    found.append(Cameras(file, functools.partial(_metashape_frames, file)))
-    return sorted(found, key=lambda cameras: cameras.file.name.lower() != METASHAPE_FILE)
+                    cameras.append(Cameras(file, functools.partial(_metashape_frames, file)))
+    return sorted(cameras, key=lambda each: each.file.name.lower() != METASHAPE_FILE)
 
 
 def _metashape_frames(file: Path) -> Frames:
@@ -245,13 +245,13 @@ def _equidistant_terms(lens: dict[str, Any], what: str) -> dict[str, float]:
 
 def realityscan(path: Path) -> list[Cameras]:
     """Return the cameras of RealityScan's XMP files in a folder, and of those anywhere below its folder images."""
-    found = []
+    cameras = []
     for names in (path.glob("*.xmp"), (path / "images").rglob("*.xmp")):
         files = [file for file in sorted(names) if b"xcr:Rotation" in read_regular(file, MOST_BYTES)]
         # Files of another alignment may be left in one of the two.
         if files:
-            found.append(Cameras(files[0], functools.partial(_realityscan_frames, path, files)))
-    return found
+            cameras.append(Cameras(files[0], functools.partial(_realityscan_frames, path, files)))
+    return cameras
 
 
 def _realityscan_frames(path: Path, files: list[Path]) -> Frames:

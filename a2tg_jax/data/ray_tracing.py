@@ -1,8 +1,9 @@
 """Surfaces of the built-in scenes: shapes that rays can hit, with an image on them, and the light on them.
 
-Vectors are float32 with their components first, [3, P], which makes numpy several times faster. Rays are origin +
-t·direction, directions not necessarily unit; t is infinite if a ray misses. (u, v) in [0, 1] run along the columns and
-rows of a surface's image. Light is multiplied once into the images, so that every view sees the same.
+Vectors are float32 with their components first, [3, P], which makes numpy several times faster. (Python's numbers do
+not change the type of an array.) Rays are origin + t·direction, directions not necessarily unit; t is infinite if a ray
+misses. (u, v) in [0, 1] run along the columns and rows of a surface's image. Light is multiplied once into the images,
+so that every view sees the same.
 
 Each shape has three methods. `hit` returns t [P] of the nearest hit beyond NEAR, of rays whose origins are [3, P] or
 one for all, [3, 1]. `locate` returns (u, v), each [P], of points [3, P] on the shape. `place`, its inverse, returns
@@ -43,12 +44,12 @@ class Disc:
     def hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         x, y, z = origins - column(self.center)
         dx, dy, dz = directions
-        t = z / np.maximum(-dz, np.float32(1e-9))
-        is_inside = squares(x + t * dx, y + t * dy) < np.float32(self.radius**2)
-        return np.where(is_inside & (t > NEAR), t, np.float32(np.inf))
+        t = z / np.maximum(-dz, 1e-9)
+        is_inside = squares(x + t * dx, y + t * dy) < self.radius**2
+        return np.where(is_inside & (t > NEAR), t, np.inf)
 
     def locate(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        u, v, _ = 0.5 + (points - column(self.center)) / np.float32(2 * self.radius)
+        u, v, _ = 0.5 + (points - column(self.center)) / (2 * self.radius)
         return u, v
 
     def place(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -72,15 +73,15 @@ class Tube:
     def hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         x, y, z = origins - column(self.center)
         dx, dy, dz = directions
-        near, far = quadratic_roots(squares(dx, dy), x * dx + y * dy, squares(x, y) - np.float32(self.radius**2))
+        near, far = quadratic_roots(squares(dx, dy), x * dx + y * dy, squares(x, y) - self.radius**2)
         t = far if self.is_inward else near
         at = z + t * dz
-        return np.where((t > NEAR) & (at > 0) & (at < self.height), t, np.float32(np.inf))
+        return np.where((t > NEAR) & (at > 0) & (at < self.height), t, np.inf)
 
     def locate(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         x, y, z = points - column(self.center)
-        turns = np.arctan2(y, x) * np.float32(0.5 / np.pi) + np.float32(0.5)
-        return (1 - turns if self.is_inward else turns), 1 - z / np.float32(self.height)
+        turns = np.arctan2(y, x) * (0.5 / np.pi) + 0.5
+        return (1 - turns if self.is_inward else turns), 1 - z / self.height
 
     def place(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         angle = 2 * np.pi * ((1 - u if self.is_inward else u) - 0.5)
@@ -99,14 +100,14 @@ class Ball:
     def hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         x, y, z = origins - column(self.center)
         dx, dy, dz = directions
-        constant = squares(x, y, z) - np.float32(self.radius**2)
+        constant = squares(x, y, z) - self.radius**2
         t, _ = quadratic_roots(squares(dx, dy, dz), x * dx + y * dy + z * dz, constant)
-        return np.where(t > NEAR, t, np.float32(np.inf))
+        return np.where(t > NEAR, t, np.inf)
 
     def locate(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        x, y, z = (points - column(self.center)) / np.float32(self.radius)
-        longitude = np.arctan2(y, x) * np.float32(0.5 / np.pi) + np.float32(0.5)
-        return longitude, np.arccos(np.clip(z, -1, 1)) * np.float32(1 / np.pi)
+        x, y, z = (points - column(self.center)) / self.radius
+        longitude = np.arctan2(y, x) * (0.5 / np.pi) + 0.5
+        return longitude, np.arccos(np.clip(z, -1, 1)) * (1 / np.pi)
 
     def place(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         longitude = 2 * np.pi * (u - 0.5)
@@ -134,16 +135,16 @@ class Block:
 
     def hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         # A ray is in the cube where it is between the planes of all three axes at once.
-        entry = np.float32(NEAR)
-        leaving = np.float32(np.inf)
+        entry = NEAR
+        leaving = np.inf
         positions = self.axes @ (origins - column(self.center))
         for position, speed in zip(positions, self.axes @ directions, strict=True):
-            inverse = 1 / np.where(np.abs(speed) < 1e-9, np.float32(1e-9), speed)  # No 1 / 0 for a ray along a face.
+            inverse = 1 / np.where(np.abs(speed) < 1e-9, 1e-9, speed)  # No 1 / 0 for a ray along a face.
             middle = -position * inverse
             reach = np.abs(inverse)
             entry = np.maximum(entry, middle - reach)
             leaving = np.minimum(leaving, middle + reach)
-        return np.where((entry < leaving) & (entry > NEAR), entry, np.float32(np.inf))
+        return np.where((entry < leaving) & (entry > NEAR), entry, np.inf)
 
     def locate(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         x, y, z = self.axes @ (points - column(self.center))
@@ -151,7 +152,7 @@ class Block:
         # The inverse of `rights` and `downs` in place.
         along = np.choose(face, [y, -x, -y, x, x])
         down = np.where(face == 4, -y, -z)
-        inside = np.float32(0.9999)  # 1 would be on the next face of the image.
+        inside = 0.9999  # 1 would be on the next face of the image.
         return (face + np.clip(0.5 + 0.5 * along, 0, inside)) / 5, np.clip(0.5 + 0.5 * down, 0, inside)
 
     def place(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

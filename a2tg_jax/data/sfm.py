@@ -158,7 +158,7 @@ def run_sfm(
                 if (undistorted / name).exists():
                     shutil.move(undistorted / name, out / name)
     error = model.compute_mean_reprojection_error()
-    longest_side = max(int(side) for camera in model.cameras.values() for side in (camera.width, camera.height))
+    longest_side = int(max(max(camera.width, camera.height) for camera in model.cameras.values()))
     return SfmSummary(len(names), model.num_reg_images(), model.num_points3D(), error, longest_side)
 
 

@@ -113,7 +113,6 @@ def stage(
       tell: function that receives lines about what was found.
     """
     folder = work / "photos"
-    files: list[tuple[int, Path, str]] = []
     chosen: dict[Path, list[Path] | None] = {}  # None: all photographs of the folder, or a video.
     for source in sources:
         if is_video(source) or not source.is_file():
@@ -124,7 +123,8 @@ def stage(
             of_folder.append(source)
     least = LEAST_PHOTOS if len(chosen) == 1 else 1
     prefixes = _prefixes(list(chosen))
-    for number, (source, prefix) in enumerate(zip(chosen, prefixes, strict=True)):
+    files: list[tuple[int, Path, str]] = []  # Number of the source, file, and name below the folder.
+    for number, (source, some) in enumerate(chosen.items()):
         place = source
         if is_video(source):
             place = work / f"frames{number}"
@@ -134,7 +134,8 @@ def stage(
                     f"{source}: its camera barely moves, so that {written} of {num_frames} frames differ; walk around"
                 )
             tell(f"{source}: {written} of {counted(num_frames, 'frame')} taken")
-        files += [(number, place / name, prefix + name) for name in find_photos(place, least, chosen[source])]
+        for name in find_photos(place, least, some):
+            files.append((number, place / name, prefixes[number] + name))
     for _, file, name in files:
         try:
             name.encode()
@@ -144,21 +145,18 @@ def stage(
 
     def look(source: int, file: Path, name: str) -> _Photo:
         facts = picture_facts(file)
-        kind: Projection = "photograph"
-        if facts.size[0] == 2 * facts.size[1] and panorama != "no":
-            if panorama == "yes" or facts.is_panorama:
-                kind = "panorama"
-            elif facts.is_panorama is None:
-                kind = projection_of(read_pixels(file))
-        names = dict.fromkeys([*mask_names(name), *mask_names(name.removeprefix(prefixes[source]))])
-        return _Photo(source, file, name, facts, kind, None if masks is None else on_disk(masks, *names))
+        mask = None
+        if masks is not None:
+            # Names with the source's and without.
+            mask = on_disk(masks, *mask_names(name), *mask_names(name.removeprefix(prefixes[source])))
+        return _Photo(source, file, name, facts, _kind_of(file, facts, panorama), mask)
 
     videos = {number for number, source in enumerate(chosen) if is_video(source)}
     photos = _decided(map_in_threads(look, *zip(*files, strict=True)), videos)
     lacking = [photo.name for photo in photos if photo.mask is None]
-    if masks is not None and len(lacking) == len(photos):
-        raise ValueError(f"{masks}: holds no mask of a photograph, called {lacking[0]}.png for {lacking[0]}")
     if masks is not None:
+        if len(lacking) == len(photos):
+            raise ValueError(f"{masks}: holds no mask of a photograph, called {lacking[0]}.png for {lacking[0]}")
         warn_of_lacking_masks(masks, lacking, len(photos))
     grey: list[Path] = []
     groups = _stage_flat([photo for photo in photos if photo.kind == "photograph"], folder, grey)
@@ -169,6 +167,16 @@ def stage(
     if num_turned:
         tell(f"{counted(num_turned, 'photograph')} turned as EXIF says")
     return Staged(folder, groups, rigs)
+
+
+def _kind_of(file: Path, facts: PictureFacts, panorama: Panorama) -> Projection:
+    """Return what a picture is, by its shape, its metadata and, if need be, its pixels."""
+    width, height = facts.size
+    if panorama == "no" or width != 2 * height:
+        return "photograph"
+    if panorama == "yes" or facts.is_panorama:
+        return "panorama"
+    return projection_of(read_pixels(file)) if facts.is_panorama is None else "photograph"
 
 
 def _decided(photos: Sequence[_Photo], videos: Container[int]) -> list[_Photo]:
@@ -207,7 +215,8 @@ def _prefixes(sources: Sequence[Path]) -> list[str]:
     if len(sources) == 1:
         return [""]
     stems = [source.stem if is_video(source) else source.name for source in map(Path.resolve, sources)]
-    return [f"{stem}/" for stem in _made_unique([stem or "photos" for stem in stems])]
+    unique = _made_unique([stem or "photos" for stem in stems])
+    return [f"{stem}/" for stem in unique]
 
 
 def _made_unique(names: Sequence[str], others: Iterable[str] = ()) -> list[str]:
@@ -215,15 +224,19 @@ def _made_unique(names: Sequence[str], others: Iterable[str] = ()) -> list[str]:
 
     Names that differ in case only are the same, because they are on some disks.
     """
-    # A file cannot have the name of a folder in which others are.
+    # No file can have the name of a folder that is needed for another file.
     taken = {str(folder).casefold() for name in names for folder in PurePosixPath(name).parents}
     taken |= {other.casefold() for other in others}
     unique = []
-    for path in map(PurePosixPath, names):
-        tried = (path.with_name(f"{path.stem}~{number}{path.suffix}") for number in itertools.count(2))
-        name = next(str(name) for name in itertools.chain([path], tried) if str(name).casefold() not in taken)
-        taken.add(name.casefold())
-        unique.append(name)
+    for name in names:
+        path = PurePosixPath(name)
+        candidate = name
+        for number in itertools.count(2):
+            if candidate.casefold() not in taken:
+                break
+            candidate = str(path.with_name(f"{path.stem}~{number}{path.suffix}"))
+        taken.add(candidate.casefold())
+        unique.append(candidate)
     return unique
 
 

@@ -57,7 +57,7 @@ class Cameras(NamedTuple):
     """Cameras of another program that were found in a folder."""
 
     file: Path
-    """Their file or folder, which tells them from others next to them."""
+    """Their file or folder, which messages name."""
     read: Callable[[], Frames]
     """Function that reads them."""
 
@@ -120,10 +120,10 @@ def load_blender(folder: Path, options: Options) -> Scene:
     return assemble_scene(scene_name(folder), train, test, cloud, source=str(folder), is_object=True)
 
 
-def load_frames(found: Sequence[Cameras], options: Options) -> Scene:
+def load_frames(cameras: Sequence[Cameras], options: Options) -> Scene:
     """Make a scene of the first of some cameras of another program, with a warning that names the others."""
-    chosen = found[0]
-    warn_of_others(chosen.file, [cameras.file for cameras in found])
+    chosen = cameras[0]
+    warn_of_others(chosen.file, [each.file for each in cameras])
     frames = chosen.read()
     (shots,) = _read_shots({frames.file: {"frames": frames.frames}}, options, frames.counted)
     name = scene_name(frames.file.resolve().parent)
