@@ -20,10 +20,7 @@ def __getattr__(name: str) -> Any:
         return importlib.import_module(f"{__name__}.{name}")
     # Most names start JAX.
     importlib.import_module(f"{__name__}.host.machine").check_ulimits()
-    value = _import_name(name)
-    # Each time, because it completes the modules that are imported so far.
-    importlib.import_module(f"{__name__}.host.field_docs").list_fields()
-    return value
+    return _import_name(name)
 
 
 def __dir__() -> list[str]:

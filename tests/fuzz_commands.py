@@ -18,7 +18,7 @@ REACHED = "all was read"
 def write_runs(folder: Path) -> None:
     """A finished run of every system, each with its record, history, metrics and models."""
     from run_folders import create_run
-    from small_models import some_model
+    from small_models import some_model, with_row
 
     from a2tg_jax import save_model
     from a2tg_jax.results.folder import write_json
@@ -28,7 +28,7 @@ def write_runs(folder: Path) -> None:
 
     history = History.empty()
     for iteration in range(1, 6):
-        history = history.with_point(1, iteration, 0.5 / iteration, 20.0, 12, 0.1, float(iteration))
+        history = with_row(history, 1, iteration, 0.5 / iteration, 20.0, 12, 0.1, float(iteration))
     for name in SYSTEMS:
         run, system = create_run(folder / name), chosen_system(name, "smoke")
         record = RunRecord(SceneSource("synthetic"), name, system, ("gaussians-2d-mcmc",), "smoke")

@@ -14,7 +14,7 @@ from fuzz_mutate import zipped
 from fuzz_readers import PICTURES
 from PIL import Image
 from run_folders import create_run
-from small_models import some_checkpoint, some_model
+from small_models import some_checkpoint, some_model, with_row
 from test_captures import write_metashape, write_polycam_with_depth, write_realityscan, write_record3d
 from test_data_colmap import CAMERAS, write_scene as write_colmap
 from test_data_transforms import FOCAL, SIZE, write_blender, write_frames, write_json, write_ply
@@ -172,6 +172,6 @@ def _write_run(folder: Path) -> None:
     save_model(run.own(run.model("a2tg-textures")), some_model())
     history = History.empty()
     for iteration in range(1, 6):
-        history = history.with_point(1, iteration, 0.5 / iteration, 20.0, 12, 0.1, float(iteration), l1=0.25)
+        history = with_row(history, 1, iteration, 0.5 / iteration, 20.0, 12, 0.1, float(iteration), l1=0.25)
     write_history(run.own(folder / "history" / "a.csv"), history)
     shutil.rmtree(folder / "checkpoints", ignore_errors=True)

@@ -100,9 +100,7 @@ def _record(folder: Path, file: Path) -> None:
 
 def _marker(folder: Path, file: Path) -> None:
     run = RunFolder(folder)
-    names = run.written()
-    if hasattr(run, "own_files"):
-        assert all(path.resolve().is_relative_to(folder) for path in run.own_files(names))
+    assert all(path.resolve().is_relative_to(folder) for path in run.files())
     check_free(folder, overwrite=True)
 
 

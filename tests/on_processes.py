@@ -24,7 +24,8 @@ from jax.experimental import multihost_utils
 from on_devices import attempted, close, plain, scene, system
 
 import a2tg_jax as a2tg
-from a2tg_jax.parallel import ProcessPlace, joined, whole
+from a2tg_jax.cli.processes import ProcessPlace, joined
+from a2tg_jax.parallel import whole
 from a2tg_jax.systems.baselines import Gaussians2dMcmc
 from a2tg_jax.training import Session, loop
 from a2tg_jax.training.batches import PhotoStore

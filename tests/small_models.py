@@ -11,6 +11,7 @@ from a2tg_jax.core.origin import Origin
 from a2tg_jax.events import Now
 from a2tg_jax.model import Model
 from a2tg_jax.training import Checkpoint, History
+from a2tg_jax.training.checkpoint import COLUMNS, TERM
 from a2tg_jax.training.step import initial_state
 
 NUM = 12
@@ -34,11 +35,19 @@ def some_model(system=None):
     return Model(gaussians, appearance, origin=some_origin())
 
 
+def with_row(history: History, *values: float, **terms: float) -> History:
+    """The history with a further row: values in the order of the fields, and loss terms by name."""
+    row = dict(zip(COLUMNS, values, strict=True))
+    for name, value in terms.items():
+        row[f"{TERM}{name}"] = value
+    return history.followed_by(History.of_rows([row]))
+
+
 def some_checkpoint(system):
     model = some_model(system)
     live = Model(model.gaussians, model.appearance, jnp.int32(NUM - 2))
     stages = system.stages()
-    history = History.empty().with_point(len(stages), 1, 0.5, 20.0, NUM, 0.1, 2.0)
+    history = with_row(History.empty(), len(stages), 1, 0.5, 20.0, NUM, 0.1, 2.0)
     return Checkpoint(system, len(stages) - 1, initial_state(stages[-1], live), history)
 
 

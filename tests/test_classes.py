@@ -13,7 +13,7 @@ import a2tg_jax as a2tg
 from a2tg_jax.core.pytree import beside, num_compiled
 from a2tg_jax.events import Change
 from a2tg_jax.mcmc import Noise
-from a2tg_jax.results.record import plan_run
+from a2tg_jax.results.plan import plan_run
 
 
 def appearance_of(index: int) -> type:

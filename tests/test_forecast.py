@@ -22,16 +22,17 @@ from a2tg_jax.densify.pruning import Prune
 from a2tg_jax.host import machine, progress_bars
 from a2tg_jax.host.machine import allowed_memory
 from a2tg_jax.mcmc import Mcmc
+from a2tg_jax.results.commands import quick_flags
 from a2tg_jax.results.forecast import (
     RunForecast,
     doubts_about,
     forecast_run,
     print_forecast,
-    quick_flags,
     room_for_photographs,
     time_after,
 )
-from a2tg_jax.results.record import RunRecord, SceneSource, plan_run
+from a2tg_jax.results.plan import plan_run
+from a2tg_jax.results.record import RunRecord, SceneSource
 from a2tg_jax.training import SYSTEMS, fitting, reports
 from a2tg_jax.training.corrections import BilateralGrid, sliced
 from a2tg_jax.training.cost import Bytes, check_rows_fit, forecast_stages, stage_bytes

@@ -109,7 +109,7 @@ def test_a_marker_names_no_file_but_those_in_its_folder(tmp_path, line):
     (run.path / "loop").symlink_to(run.path / "loop")
     with open(run.marker, "ab") as file:
         file.write(line + b"\n")
-    assert run.own_files(run.written()) == [run.metrics]
+    assert run.files() == [run.metrics]
 
 
 # Records whose options cannot be

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import jax
 import numpy as np
+from small_models import with_row
 from test_compact import plain, textured
 
 from a2tg_jax import Gaussians2dMcmc, synthetic_scene
@@ -41,7 +42,7 @@ def stage_run():
     """A stand-in for a stage under way."""
     state = SimpleNamespace(model=textured())
     stage = SimpleNamespace(name="textures", iterations=30)
-    history = History.empty().with_point(1, 20, 0.5, 17.0, 40, 1.25, 3.0)
+    history = with_row(History.empty(), 1, 20, 0.5, 17.0, 40, 1.25, 3.0)
     left = datetime.timedelta(seconds=70)
     return SimpleNamespace(state=state, stage=stage, history=history, system=SYSTEM, time_left=left)
 

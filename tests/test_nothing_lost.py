@@ -31,7 +31,8 @@ from a2tg_jax.host.regular_files import sha256_of
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.results import compression, forecast, run_evaluation, run_training
-from a2tg_jax.results.folder import OLD, RunFolder, check_apart, old_run, opened, put_back_old, set_aside
+from a2tg_jax.results.folder import OLD, RunFolder, old_run, opened, put_back_old, set_aside
+from a2tg_jax.results.output_paths import check_apart
 from a2tg_jax.results.record import RunRecord, SceneSource, read_record, read_run_file, write_record
 from a2tg_jax.results.run_training import MOST_RESTORED, RunOptions, train_run
 from a2tg_jax.systems.baselines import Gaussians2dMcmc

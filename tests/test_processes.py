@@ -1,7 +1,6 @@
 """Several processes that train together: those of this machine (`on_processes`)."""
 
 import dataclasses
-import os
 import re
 import signal
 from types import SimpleNamespace
@@ -14,13 +13,14 @@ from run_folders import create_run
 
 import a2tg_jax as a2tg
 from a2tg_jax.cli import main as cli
+from a2tg_jax.cli.processes import LOST, is_lost
 from a2tg_jax.cli.train import train_defaults
 from a2tg_jax.host.machine import Devices
 from a2tg_jax.io.archive import write_archive
 from a2tg_jax.io.model_file import load_model
-from a2tg_jax.parallel import LOST, is_lost
-from a2tg_jax.results import run_training
-from a2tg_jax.results.folder import RunFolder, resuming_command
+from a2tg_jax.results import run_processes
+from a2tg_jax.results.commands import resuming_command
+from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.history import read_history
 from a2tg_jax.results.record import RunRecord, SceneSource, read_record, write_record
 from a2tg_jax.training import Session, fit_stage
@@ -78,13 +78,13 @@ def test_a_process_that_does_not_come_is_reported():
     """And before, that there is no cluster."""
     code = f"""
 import sys
-from a2tg_jax import parallel
+from a2tg_jax.cli import processes
 try:
-    parallel.joined(parallel.ProcessPlace("auto", None, None, 60.0), str).__enter__()
+    processes.joined(processes.ProcessPlace("auto", None, None, 60.0), str).__enter__()
 except ValueError as error:
     print(error, file=sys.stderr)
-parallel.JOIN_SECONDS = 1
-parallel.joined(parallel.ProcessPlace("127.0.0.1:{free_port()}", 2, 0, 60.0), str).__enter__()
+processes.JOIN_SECONDS = 1
+processes.joined(processes.ProcessPlace("127.0.0.1:{free_port()}", 2, 0, 60.0), str).__enter__()
 """
     alone = started(["-c", code])
     printed = alone.communicate(timeout=120)[1]
@@ -114,10 +114,10 @@ def test_digests_differ_where_training_would():
         """Whether options, devices and scene have other digests."""
         views = dataclasses.replace(view, **dict(own)), *scene.train[1:]
         changed = dataclasses.replace(scene, train=views, **changes)
-        found = run_training.digests_of(record, changed, session)
+        found = run_processes.digests_of(record, changed, session)
         return [a != b for a, b in zip(found, wanted, strict=True)]
 
-    wanted = run_training.digests_of(record, scene, Session())
+    wanted = run_processes.digests_of(record, scene, Session())
     assert differ(dataclasses.replace(record, scene=SceneSource("there"))) == [False] * 3
     camera = dataclasses.replace(view.camera, viewmat=view.camera.viewmat + np.float32(1e-6))
     fisheye = dataclasses.replace(view.camera, rays=np.zeros((*size, 2), np.float32))
@@ -169,30 +169,3 @@ def test_a_lack_of_memory_is_no_lost_process():
 def test_wrong_places_are_reported(tmp_path, capsys, flags, printed):
     assert cli.main(["train", "synthetic", "--out", str(tmp_path / "run"), *flags.split()]) == 2
     assert printed in capsys.readouterr().err
-
-
-@pytest.mark.long
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes cannot fork here")
-def test_a_forked_child_says_what_to_do_where_it_would_hang():
-    """Before JAX starts anything, a fork is fine: the program is itself a child."""
-    code = """
-import os, warnings
-import a2tg_jax.training as _, a2tg_jax as a2tg
-if os.fork():
-    os._exit(os.waitstatus_to_exitcode(os.wait()[1]))
-scene, system = a2tg.synthetic_scene(num_views=3, width=16, height=12), a2tg.Gaussians2d.preset("smoke")
-model, view = a2tg.Model(a2tg.init_from_points(scene.points, scene.colors, num=9)), scene.train[0]
-print(model.render(view.camera).color.shape, flush=True)
-warnings.simplefilter("ignore", RuntimeWarning)  # JAX warns of each fork
-if not os.fork():
-    for call in "model.render(view.camera)", "a2tg.evaluate([view], model)", "a2tg.fit(scene, system)":
-        try:
-            eval(call)
-        except RuntimeError as error:
-            print(error, flush=True)
-    os._exit(0)
-os.wait()
-"""
-    rendered, *printed = started(["-c", code]).communicate(timeout=60)[0].splitlines()
-    assert rendered == "(12, 16, 3)" and len(printed) == 3
-    assert all("waits for its threads forever: start processes by spawn" in line for line in printed)

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from run_folders import NAMES, RECORD, circle, create_run, some_history, some_result, tensorboard_scalars
+from small_models import with_row
 
 import a2tg_jax as a2tg
 from a2tg_jax.adapt import Upscale
@@ -32,30 +33,14 @@ from a2tg_jax.measure.evaluation import evaluate
 from a2tg_jax.measure.metrics import psnr
 from a2tg_jax.model import Model
 from a2tg_jax.render import render_image
-from a2tg_jax.results.folder import (
-    OLD,
-    RunFolder,
-    check_export,
-    check_free,
-    check_new,
-    check_output,
-    drop_old,
-    open_run,
-    set_aside,
-)
+from a2tg_jax.results.commands import repeating_command
+from a2tg_jax.results.folder import OLD, RunFolder, check_free, drop_old, open_run, set_aside
 from a2tg_jax.results.history import EventWriter, read_history, write_history
 from a2tg_jax.results.images import to_uint8
 from a2tg_jax.results.info import describe_run
-from a2tg_jax.results.record import (
-    RunRecord,
-    SceneSource,
-    contradictions,
-    plan_run,
-    read_record,
-    read_run_file,
-    repeating_command,
-    write_record,
-)
+from a2tg_jax.results.output_paths import check_export, check_new, check_output
+from a2tg_jax.results.plan import plan_run
+from a2tg_jax.results.record import RunRecord, SceneSource, contradictions, read_record, read_run_file, write_record
 from a2tg_jax.results.report import (
     bytes_compared,
     metrics_json,
@@ -681,8 +666,8 @@ def test_one_line_says_what_the_photographs_allow(train, ending):
 
 def test_history_round_trip_with_loss_terms(tmp_path):
     """One of two stages has a term that the other lacks."""
-    one = some_history(num=2).with_point(1, 3, 0.3, 20.0, 5, 0.1, 2.0, l1=0.25, roughness=0.05)
-    both = one.followed_by(some_history(num=1).with_point(2, 2, 0.2, 20.0, 5, 0.1, 2.0, l1=0.2))
+    one = with_row(some_history(num=2), 1, 3, 0.3, 20.0, 5, 0.1, 2.0, l1=0.25, roughness=0.05)
+    both = one.followed_by(with_row(some_history(num=1), 2, 2, 0.2, 20.0, 5, 0.1, 2.0, l1=0.2))
     for history in (some_history(), both):
         write_history(tmp_path / "h.csv", history)
         found = read_history(tmp_path / "h.csv").to_dict()
@@ -706,7 +691,7 @@ def written_for_tensorboard(run, *histories, skipped=None):
 def test_tensorboard_gets_each_row_once(tmp_path):
     """A file has the new rows of each call; another process adds the rows after the checkpoint."""
     run = RunFolder(tmp_path)
-    wanted = some_history(num=9).with_point(1, 10, 0.3, 20.0, 5, 0.1, 2.0, l1=0.25)
+    wanted = with_row(some_history(num=9), 1, 10, 0.3, 20.0, 5, 0.1, 2.0, l1=0.25)
     written_for_tensorboard(run, some_history(num=3), some_history(num=3), some_history(num=7))
     written_for_tensorboard(run, wanted, skipped=some_history(num=7))
     found = tensorboard_scalars(run.tensorboard)
@@ -717,7 +702,7 @@ def test_tensorboard_gets_each_row_once(tmp_path):
         steps, values = zip(*found[f"{column}/a2tg-gaussians"], strict=True)
         assert steps == (*range(1, 11),)
         np.testing.assert_allclose(values, getattr(wanted, column), rtol=1e-6)
-    assert sorted(run.own_files(run.written())) == sorted(run.tensorboard.iterdir())
+    assert sorted(run.files()) == sorted(run.tensorboard.iterdir())
     run.clear()
     assert not run.tensorboard.exists()
 

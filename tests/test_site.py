@@ -9,7 +9,6 @@ import pytest
 import site_pages
 
 import a2tg_jax as a2tg
-from a2tg_jax.cli.flags import FLAGS
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -44,13 +43,6 @@ def test_the_page_of_options_has_every_command_with_its_arguments_and_choices():
     assert re.findall(r"^## `a2tg (\w+)`$", written, re.MULTILINE) == list(options.command_line.COMMANDS)
     assert "\n| `PHOTOS... SCENE` |" in written
     assert "OPENCV_FISHEYE}` |" in written, "choices of more than a line"
-
-
-def test_the_flags_of_commands_are_those_of_the_page():
-    written = (DOCS / "options.md").read_text(encoding="utf-8")
-    found: dict[str, str] = {}
-    exec(options.flags_module(written), found)
-    assert found["FLAGS"] == FLAGS, "run python docs/scripts/options.py"
 
 
 def test_options_beside_those_of_other_programs_exist():

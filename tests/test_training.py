@@ -10,6 +10,7 @@ import pytest
 from bits import bits_of
 from kept_checkpoints import fit_keeping_checkpoints
 from own_process import passes_in_its_own_process
+from small_models import with_row
 
 from a2tg_jax import (
     A2tg,
@@ -346,6 +347,6 @@ def test_a_checkpoint_keeps_the_loss_by_term(trained, tmp_path):
     found = load_checkpoint(tmp_path / "c.npz").history
     assert set(found.terms) == {"l1", "ssim"} and len(found.loss)
     np.testing.assert_array_equal(found.terms["ssim"], kept.history.terms["ssim"])
-    longer = found.with_point(1, 99, 0.3, 20.0, 5, 0.1, 9.0, depth=0.25)
+    longer = with_row(found, 1, 99, 0.3, 20.0, 5, 0.1, 9.0, depth=0.25)
     np.testing.assert_array_equal(longer.terms["depth"], [*[np.nan] * len(found.loss), 0.25])
     assert np.isnan(longer.terms["l1"][-1])

@@ -82,7 +82,8 @@ def parse(
     about = inspect.getdoc(kind) or ""
     given: dict[str, Any] = {}
     if default is not None:
-        about, given = about.split("\n")[0], {"default": default}  # The other lines are the short help.
+        about = about.split("\n")[0]  # The other lines are the short help.
+        given["default"] = default
     command: Parsed = tyro.cli(kind, prog=program, args=arguments, description=about, registry=rules, **given)
     for word in arguments:
         # Raises ValueError for a URL, which would name a folder of this machine.
@@ -101,8 +102,11 @@ def _fill_help(value: Any) -> None:
     breaks."""
     kind = value if isinstance(value, type) else type(value)
     # Bases first, because texts of subclasses replace theirs; the last one is object.
-    params = [param for base in kind.__mro__[-2::-1] for param in parse_from_object(base).params]
-    texts = {param.arg_name: " ".join(param.description.split()) for param in params if param.description}
+    texts = {}
+    for base in kind.__mro__[-2::-1]:
+        for param in parse_from_object(base).params:
+            if param.description:
+                texts[param.arg_name] = " ".join(param.description.split())
     for field in dataclasses.fields(kind):
         if field.name in texts:
             field.metadata = types.MappingProxyType({**field.metadata, "help": texts[field.name]})

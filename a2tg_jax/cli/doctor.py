@@ -24,7 +24,9 @@ from a2tg_jax.render import render_image
 from a2tg_jax.texture import Textures, allocate_textures
 
 PACKAGES = ("jax", "jaxlib", "jax-cuda13-plugin", "jaxopt", "numpy", "llvmlite", "nvidia-cuda-nvrtc", "pycolmap")
-WIDTH, HEIGHT, NUM = 96, 64, 400
+WIDTH = 96
+HEIGHT = 64
+NUM = 400
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +37,9 @@ class Doctor:
     """
 
     def run(self) -> None:
-        device, cuda, wanted = jax.devices()[0], cuda_of_driver(), os.environ.get(VARIABLE)
+        device = jax.devices()[0]
+        cuda = cuda_of_driver()
+        wanted = os.environ.get(VARIABLE)
         # As JAX names it when it compiles; a device calls both CUDA and ROCm "gpu".
         of_jax = "cuda" if "cuda" in device.client.platform_version.lower() else device.platform
         kinds = ["the CPU" if one.platform == "cpu" else f"{one.platform} ({one.device_kind})" for one in jax.devices()]
@@ -45,7 +49,7 @@ class Doctor:
             "packages": ", ".join(f"{name} {_version(name)}" for name in PACKAGES),
             "devices": ", ".join(kinds),
             "driver": f"NVIDIA's, for CUDA {cuda[0]}.{cuda[1]}" if cuda else "no NVIDIA driver is found",
-            "threads": f"{num_threads()} ({VARIABLE}{f'={wanted}' if wanted else ' is not set'})",
+            "threads": f"{num_threads()} ({f'{VARIABLE}={wanted}' if wanted else f'{VARIABLE} is not set'})",
             "memory": f"{memory_limit() / 1e9:.1f} GB may be used",
             "XLA_FLAGS": os.environ.get("XLA_FLAGS") or "not set",
             "cache": str(compilation_cache_folder()),
@@ -102,16 +106,18 @@ def _compare(available: Sequence[Compositor]) -> float:
         color = render_image(gaussians, camera, textures, settings=settings).color
         return jnp.sum(color**2), color
 
-    found, largest = {}, 0.0
+    arrays = {}
+    largest = 0.0
     for name in ("xla", *available):  # First, to compare the others with it.
         start = time.perf_counter()
         settings = RenderSettings(compositor=name, capacity=1 << 16)  # Room for all Gaussians in all tiles.
         gradient = jax.grad(loss, argnums=(0, 1), has_aux=True, allow_int=True)(gaussians, textures, settings)
-        arrays = [np.asarray(leaf) for leaf in jax.tree.leaves(gradient)]
-        found[name] = [array for array in arrays if np.issubdtype(array.dtype, np.floating)]
+        leaves = map(np.asarray, jax.tree.leaves(gradient))
+        arrays[name] = [leaf for leaf in leaves if np.issubdtype(leaf.dtype, np.floating)]
         text = f"{name}: {time.perf_counter() - start:.2f} s with compiling"
         if name != "xla":
-            difference = float(np.nan_to_num(relative_difference(found[name], found["xla"]), nan=np.inf))
-            text, largest = f"{text}, at most {difference:.1g} from XLA's image and gradients", max(largest, difference)
+            difference = float(np.nan_to_num(relative_difference(arrays[name], arrays["xla"]), nan=np.inf))
+            largest = max(largest, difference)
+            text += f", at most {difference:.1g} from XLA's image and gradients"
         _print("render", text)
     return largest

@@ -15,9 +15,9 @@ from a2tg_jax.data.sfm import CameraModel, Matching, run_sfm
 from a2tg_jax.data.staging import Panorama
 from a2tg_jax.data.video import DEFAULT_FRAMES
 from a2tg_jax.host.text import defaulting_to, did_you_mean
+from a2tg_jax.results.commands import quick_flags
 from a2tg_jax.results.figures import save_camera_picture
-from a2tg_jax.results.folder import check_apart, check_output
-from a2tg_jax.results.forecast import quick_flags
+from a2tg_jax.results.output_paths import check_apart, check_output
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Sfm:
             if is_scene(source):
                 print(f"{source} has cameras already, which a2tg train reads; COLMAP finds them again", flush=True)
         check_output(out)
-        found = run_sfm(
+        summary = run_sfm(
             sources,
             out,
             masks=self.masks,
@@ -78,11 +78,11 @@ class Sfm:
         )
         save_camera_picture(out, out / CAMERA_PICTURE)
         print(
-            f"{found.num_registered} of {found.num_photos} photographs registered, {found.num_points:,} points, "
-            f"mean reprojection error {found.mean_error:.2f} pixels"
+            f"{summary.num_registered} of {summary.num_photos} photographs registered, {summary.num_points:,} points, "
+            f"mean reprojection error {summary.mean_error:.2f} pixels"
         )
         run = ["a2tg", "train", str(out), "--out", f"runs/{out.resolve().name}"]
-        command = f"{shlex.join(run)} {quick_flags(found.longest_side)}"
+        command = f"{shlex.join(run)} {quick_flags(summary.longest_side)}"
         print(f"cameras: {out / CAMERA_PICTURE}\nscene: {out}; continue with: {command}")
 
     def _places(self) -> tuple[list[Path], Path]:

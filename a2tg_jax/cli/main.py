@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from typing import Any
 
-from a2tg_jax.cli.flags import FLAGS
 from a2tg_jax.host import signals
 from a2tg_jax.host.errors import error_text
 from a2tg_jax.host.machine import check_ulimits
@@ -54,8 +53,6 @@ COMMANDS = {
     "sfm": "inputs:Sfm", "download": "inputs:Download", "doctor": "doctor:Doctor",
 }  # fmt: skip
 """Module of `a2tg_jax.cli` and dataclass of each command."""
-CONVERTED = ("ply", "sog", "spz", "splat", "ksplat", "glb", "gltf", "usdz", "usda", "usdc", "npz", "a2tgz")
-"""Suffixes of files that convert writes, tried as flags of export. `io.formats` has them too, but imports JAX."""
 WITHOUT_JAX = frozenset({"sfm", "download"})
 """Commands that do not start JAX."""
 HELP = frozenset({"-h", "--help", "--help-all"})
@@ -77,43 +74,26 @@ def main(argv: Sequence[str] | None = None) -> int:
       The exit code: 0, 2 after a user's error (on stderr), 130 after Ctrl-C, 143 after SIGTERM, 129 after SIGHUP, 138
       after SIGUSR1, 141 if the pipe that reads the output is closed.
     """
-    name, *arguments = (sys.argv[1:] if argv is None else list(argv)) or ["--help"]
-    if name not in (*COMMANDS, "-h", "--help", "--version"):
-        near = did_you_mean(name, COMMANDS)
-        return _fail(f"there is no command {name!r}{near or ';'} the commands are {', '.join(COMMANDS)}")
-    if name in COMMANDS and (error := _misspelt_flag(name, arguments)):
-        return _fail(error)
+    words = list(sys.argv[1:] if argv is None else argv)
+    name = words[0] if words else "--help"
+    arguments = words[1:]
     try:
-        if name not in COMMANDS:
-            print(version("a2tg-jax") if name == "--version" else OVERVIEW, flush=True)
-            return 0
-        with warnings.catch_warnings(), signals.raised():
-            warnings.showwarning = _show_warning
-            if name not in WITHOUT_JAX and HELP.isdisjoint(arguments):
-                check_ulimits()
-            configure_cpu()
-            try:
-                here = os.getcwd()
-            except FileNotFoundError:
-                raise ValueError("the current folder was deleted: change to one that exists") from None
-            if here not in sys.path:  # Custom systems are modules there. At the end, it hides no other module.
-                sys.path.append(here)
-            if name == "train" and {"-h", "--help"} & set(arguments):
-                from a2tg_jax.cli.train import defaults_line
-
-                print(f"usage: a2tg train SCENE --out RUN [OPTIONS]\n\n{inspect.getdoc(command_class(name))}")
-                with contextlib.suppress(ValueError, OSError, SystemExit):  # Help also with a wrong system or file.
-                    print(f"\n{defaults_line(arguments)}")
-                return 0
-            try:
-                command = parsed(name, arguments)
-            except SystemExit as end:  # tyro has printed help, or an error.
-                return int(end.code or 0)
-            command.run()
-            # A closed pipe raises here, not at exit.
-            sys.stdout.flush()
-    except KeyboardInterrupt as stop:
-        stopped = signals.Stopped.of(stop)
+        if name in COMMANDS:
+            with warnings.catch_warnings(), signals.raised():
+                warnings.showwarning = _show_warning
+                exit_code = _run(name, arguments)
+        elif name in ("-h", "--help"):
+            exit_code = _printed(OVERVIEW)
+        elif name == "--version":
+            exit_code = _printed(version("a2tg-jax"))
+        else:
+            near = did_you_mean(name, COMMANDS)
+            exit_code = _fail(f"there is no command {name!r}{near or ';'} the commands are {', '.join(COMMANDS)}")
+        # A closed pipe raises here, not at exit.
+        sys.stdout.flush()
+        return exit_code
+    except KeyboardInterrupt as interrupt:
+        stopped = signals.Stopped.of(interrupt)
         print(f"a2tg: interrupted{stopped.advice and '; ' + stopped.advice}", file=sys.stderr)
         return stopped.exit_code
     except BrokenPipeError:
@@ -124,31 +104,46 @@ def main(argv: Sequence[str] | None = None) -> int:
         text = error_text(error, SMALLER.get(name, "close other programs"))
         if text is None or os.environ.get("A2TG_DEBUG"):
             raise
+        # Errors begin with the name of an option: print it as typed.
         option, space, rest = text.partition(" ")
-        flag = f"--{option.replace('_', '-')}"  # Errors begin with the name of an option: print it as typed.
+        flag = _flag(option)
         is_typed = any(word.partition("=")[0] == flag for word in arguments)
         return _fail(f"{flag}{space}{rest}" if is_typed else text)
+
+
+def _run(name: str, arguments: Sequence[str]) -> int:
+    """Run a command of `COMMANDS` and return its exit code."""
+    if name not in WITHOUT_JAX and HELP.isdisjoint(arguments):
+        check_ulimits()
+    configure_cpu()
+    try:
+        here = os.getcwd()
+    except FileNotFoundError:
+        raise ValueError("the current folder was deleted: change to one that exists") from None
+    if here not in sys.path:  # Custom systems are modules there. At the end, it hides no other module.
+        sys.path.append(here)
+    if name == "train" and {"-h", "--help"} & set(arguments):
+        return _print_help_of_train(arguments)
+    try:
+        command = parsed(name, arguments)
+    except SystemExit as end:  # tyro has printed help, or an error.
+        return int(end.code or 0)
+    command.run()
     return 0
 
 
-def _misspelt_flag(name: str, arguments: Sequence[str]) -> str | None:
-    """Return an error for the first flag that a command lacks; None if there is none, or custom systems may have it."""
-    known = {"help", "help-all", *FLAGS[name].split()}
-    given = [word.partition("=")[0][2:].replace("_", "-") for word in arguments if word.startswith("--")]
-    # A configuration file may name one.
-    is_custom = {"config", "resume"} & set(given) or any(":" in word for word in arguments)
-    if name == "train" and is_custom:
-        return None
-    for flag in given:
-        if flag not in known and re.sub(r"(^|\.)no-", r"\1", flag) not in known:
-            if name == "export" and flag in CONVERTED:
-                return f"a2tg export has no option --{flag}: a2tg convert writes such files, by the suffix of OUT"
-            # Of a group first, such as densify.cap for cap.
-            within = sorted(each for each in known if each.endswith(f".{flag}"))
-            near = f"; did you mean {' or '.join(within)}?" if within else did_you_mean(flag, known)
-            hint = re.sub(r"(mean|or) ", r"\1 --", near) if near else f"; a2tg {name} --help lists them"
-            return f"a2tg {name} has no option --{flag}{hint}"
-    return None
+def _print_help_of_train(arguments: Sequence[str]) -> int:
+    from a2tg_jax.cli.train import Train, defaults_line
+
+    print(f"usage: a2tg train SCENE --out RUN [OPTIONS]\n\n{inspect.getdoc(Train)}")
+    with contextlib.suppress(ValueError, OSError, SystemExit):  # Help also with a wrong system or file.
+        print(f"\n{defaults_line(arguments)}")
+    return 0
+
+
+def _printed(text: str) -> int:
+    print(text)
+    return 0
 
 
 def command_class(name: str) -> Any:
@@ -189,4 +184,8 @@ def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
 
 def _with_flags(message: str) -> str:
     """Replace the names of options, which messages have in backticks, by their flags."""
-    return re.sub(r"`([a-z][\w.]*)`", lambda name: f"--{name[1].replace('_', '-')}", message)
+    return re.sub(r"`([a-z][\w.]*)`", lambda name: _flag(name[1]), message)
+
+
+def _flag(option: str) -> str:
+    return f"--{option.replace('_', '-')}"

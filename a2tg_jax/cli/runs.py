@@ -16,18 +16,9 @@ from a2tg_jax.mesh.files import mesh_files
 from a2tg_jax.results.compression import CompressOptions, compress
 from a2tg_jax.results.conversion import BakeOptions, PlacementOptions, convert
 from a2tg_jax.results.editing import EditOptions, write_edit
+from a2tg_jax.results.finish_record import FinishOptions
 from a2tg_jax.results.finishing import finish_run
-from a2tg_jax.results.folder import (
-    RunFolder,
-    check_apart,
-    check_export,
-    check_not_source,
-    check_output,
-    json_text,
-    open_run,
-    opened,
-    runs_in,
-)
+from a2tg_jax.results.folder import RunFolder, json_text, open_run, opened, runs_in
 from a2tg_jax.results.frames import (
     FRAMES_PER_SECOND,
     FrameFolder,
@@ -41,7 +32,7 @@ from a2tg_jax.results.frames import (
 from a2tg_jax.results.info import describe_file, describe_run, describe_runs, facts_or_damage, file_facts, run_facts
 from a2tg_jax.results.meshing import MeshOptions, write_mesh
 from a2tg_jax.results.model_source import open_source
-from a2tg_jax.results.record import FinishOptions
+from a2tg_jax.results.output_paths import check_apart, check_export, check_not_source, check_output
 from a2tg_jax.results.report import metrics_json
 from a2tg_jax.results.run_evaluation import check_weights, evaluate_run
 from a2tg_jax.results.viewing import check_page, export_comparison, export_web, routes_of

@@ -18,6 +18,7 @@ from tyro.constructors import StructConstructorSpec, StructFieldSpec, StructType
 
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.cli.arguments import LpipsWeights
+from a2tg_jax.cli.processes import AUTO, ProcessPlace, joined
 from a2tg_jax.core.budget import budget_in_bytes
 from a2tg_jax.data.load import SceneSource
 from a2tg_jax.data.scene import Scene
@@ -27,9 +28,8 @@ from a2tg_jax.host.regular_files import expanded
 from a2tg_jax.host.text import counted, defaulting_to
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.mcmc import Mcmc
-from a2tg_jax.parallel import AUTO, ProcessPlace, joined
-from a2tg_jax.results.compression import command_for_file
-from a2tg_jax.results.folder import RunFolder, open_run, opened, resuming_command
+from a2tg_jax.results.commands import file_command, resuming_command
+from a2tg_jax.results.folder import RunFolder, open_run, opened
 from a2tg_jax.results.forecast import room_for_photographs
 from a2tg_jax.results.history import tensorboard_library
 from a2tg_jax.results.record import (
@@ -41,7 +41,8 @@ from a2tg_jax.results.record import (
     write_record,
 )
 from a2tg_jax.results.report import RunResult, sizes_line, summary_text
-from a2tg_jax.results.run_training import RunOptions, begin_run, follow_first_process, resume_run, unseen, warn
+from a2tg_jax.results.run_processes import follow_first_process
+from a2tg_jax.results.run_training import RunOptions, begin_run, resume_run, unseen, warn
 from a2tg_jax.results.viewing import shown_live
 from a2tg_jax.systems.a2tg import A2tg
 from a2tg_jax.training import Session
@@ -200,7 +201,9 @@ class Train:
         Raises:
           ValueError: if flags of several processes are missing or wrong, or exclude each other.
         """
-        number, index, seconds = self.num_processes, self.process_id, self.heartbeat_timeout_seconds
+        number = self.num_processes
+        index = self.process_id
+        seconds = self.heartbeat_timeout_seconds
         values = {"--num-processes": number, "--process-id": index}
         if self.coordinator is None:
             for flag, value in {**values, "--heartbeat-timeout-seconds": seconds}.items():
@@ -209,7 +212,8 @@ class Train:
             return None
         if self.view:
             raise ValueError("--view shows the training of one process: leave out --view or --coordinator")
-        seconds = HEARTBEAT_TIMEOUT if seconds is None else seconds
+        if seconds is None:
+            seconds = HEARTBEAT_TIMEOUT
         if not 0 < seconds < math.inf:
             raise ValueError(f"--heartbeat-timeout-seconds must be positive and finite; got {seconds:g}")
         if self.coordinator != AUTO:
@@ -218,9 +222,10 @@ class Train:
                 raise ValueError(f"--coordinator HOST:PORT also needs {' and '.join(missing)}")
             if not ADDRESS.fullmatch(self.coordinator):
                 raise ValueError(f"--coordinator must be HOST:PORT, [IPv6]:PORT or auto; got {self.coordinator!r}")
-        for flag, value, least in (("--num-processes", number, 1), ("--process-id", index, 0)):
-            if value is not None and value < least:
-                raise ValueError(f"{flag} must be at least {least}; got {value}")
+        if number is not None and number < 1:
+            raise ValueError(f"--num-processes must be at least 1; got {number}")
+        if index is not None and index < 0:
+            raise ValueError(f"--process-id must be at least 0; got {index}")
         if number is not None and index is not None and index >= number:
             raise ValueError(f"--process-id must be from 0 to {number - 1}, one less than --num-processes; got {index}")
         return ProcessPlace(self.coordinator, number, index, seconds)
@@ -241,12 +246,12 @@ class Train:
           ValueError: if a flag contradicts the record.
         """
         kept = read_record(run)
-        if (size := self.record.file_budget) != kept.file_budget:
-            other = command_for_file(run, f"{size}MB" if size else "SIZE")
-            raise ValueError(f"--file-budget is for new runs; for another file of a finished one: {other}")
-        record = self.whole_record
-        more, options = record.options.more, dataclasses.replace(record.options, more=kept.options.more)
-        record = dataclasses.replace(record, options=options)
+        size = self.record.file_budget
+        if size != kept.file_budget:
+            another = file_command(run, f"{size}MB" if size else "SIZE")
+            raise ValueError(f"--file-budget is for new runs; for another file of a finished one: {another}")
+        more = self.record.options.more
+        record = self.whole_record.with_options(more=kept.options.more)
         changed = [f"--{name.replace('_', '-')}" for name in contradictions(record, kept)]
         if is_first and record.scene.path != kept.scene.path:
             changed.insert(0, f"{record.scene.path}, as it was trained on {kept.scene.path}")
@@ -259,8 +264,7 @@ class Train:
             raise ValueError(f"--more trains a finished run on: first finish this one with {resuming_command(run)}")
         if more and self.coordinator is not None:
             raise ValueError("--more with --resume is for one process: leave out --coordinator")
-        options = dataclasses.replace(options, more=(*options.more, *more))
-        record = dataclasses.replace(record, options=options)
+        record = record.with_options(more=(*kept.options.more, *more))
         record.check()
         if is_first and record != kept:
             write_record(run, record)
@@ -286,25 +290,26 @@ def train_defaults(arguments: Sequence[str]) -> Train:
     Raises:
       ValueError, FileNotFoundError: if there is no such system, preset, file or run, or it is invalid.
     """
-    found, _ = tyro.cli(DecidingOptions, prog="a2tg train", args=arguments, return_unknown_args=True, add_help=False)
-    for path in (found.config, found.out):
+    given, _ = tyro.cli(DecidingOptions, prog="a2tg train", args=arguments, return_unknown_args=True, add_help=False)
+    for path in (given.config, given.out):
         expanded(path)  # Raises ValueError for a URL.
-    record = RunRecord(SceneSource())
-    if found.resume and found.config:
+    if given.resume and given.config:
         raise ValueError("--resume takes every option from the run folder: leave out --config")
-    if found.out and found.resume and not found.overwrite:
+    record = RunRecord(SceneSource())
+    if given.out and given.resume and not given.overwrite:
+        out = Path(given.out)
         # Several processes read the folder at once; the first one locks it later.
-        with contextlib.nullcontext(open_run(Path(found.out))) if found.coordinator else opened(Path(found.out)) as run:
-            record = read_record(run)
-            # Those that are given are added, so that the same number may be given twice.
-            record = dataclasses.replace(record, options=dataclasses.replace(record.options, more=()))
-    elif found.config:
-        record = read_run_file(Path(found.config))
+        with contextlib.nullcontext(open_run(out)) if given.coordinator else opened(out) as run:
+            # Further iterations that are given are added, so that the same number may be given twice.
+            record = read_record(run).with_options(more=())
+    elif given.config:
+        record = read_run_file(Path(given.config))
     # A resumed run keeps its system and preset; `resumed` reports other ones.
-    if not found.resume and (found.preset or found.system not in ("", record.system)):
-        record = record.with_system(found.system or record.system, found.preset or None)
-    # MISSING makes SCENE required in tyro.
-    scene = record.scene if record.scene.path else dataclasses.replace(record.scene, path=tyro.MISSING)
+    if not given.resume and (given.preset or given.system not in ("", record.system)):
+        record = record.with_system(given.system or record.system, given.preset or None)
+    scene = record.scene
+    if not scene.path:  # tyro requires what is MISSING.
+        scene = dataclasses.replace(scene, path=tyro.MISSING)
     return Train(dataclasses.replace(record, scene=scene), tyro.MISSING)
 
 
@@ -324,9 +329,9 @@ def scene_rule(info: StructTypeInfo) -> StructConstructorSpec | None:
 def defaults_line(arguments: Sequence[str]) -> str:
     """Return the most important defaults of the given system and preset."""
     record = train_defaults(arguments).record
-    options, system = flatten_config(record.options), record.system
-    found = [f"--{name.replace('_', '-')} {options[name]}" for name in IMPORTANT if name in options]
-    return f"Defaults of {system} with the preset {record.preset or 'paper'}: {' '.join(found)}"
+    options = flatten_config(record.options)
+    flags = [f"--{name.replace('_', '-')} {options[name]}" for name in IMPORTANT if name in options]
+    return f"Defaults of {record.system} with the preset {record.preset or 'paper'}: {' '.join(flags)}"
 
 
 def resume(folder: Path, options: RunOptions, check: Callable[[RunFolder], object] = lambda run: None) -> None:
@@ -357,7 +362,7 @@ def with_view_for_each(record: RunRecord, num_devices: int) -> RunRecord:
     """Return the record with as many views a step as there are devices, unless it has another number than one."""
     if num_devices == 1 or record.options.batch_size > 1:
         return record
-    return dataclasses.replace(record, options=dataclasses.replace(record.options, batch_size=num_devices))
+    return record.with_options(batch_size=num_devices)
 
 
 def devices_named(text: str) -> list[jax.Device] | None:
@@ -370,11 +375,15 @@ def devices_named(text: str) -> list[jax.Device] | None:
     if text == "all":
         text = str(len(devices))
     if not text.isdecimal() or not 1 <= int(text) <= len(devices):
-        found = f"this machine has {counted(len(devices), f'{devices[0].platform.upper()} device')}"
-        raise ValueError(f"--devices must be all, or a number from 1 to {len(devices)}; got {text!r}: {found}")
+        kind = devices[0].platform.upper()
+        raise ValueError(
+            f"--devices must be all, or a number from 1 to {len(devices)}; got {text!r}: this machine has "
+            f"{counted(len(devices), f'{kind} device')}"
+        )
     # By process, so that all have the same list.
-    by_process = [jax.local_devices(process_index=index) for index in range(jax.process_count())]
-    chosen = [device for own in by_process for device in own[: int(text)]]
+    chosen: list[jax.Device] = []
+    for index in range(jax.process_count()):
+        chosen += jax.local_devices(process_index=index)[: int(text)]
     return chosen if len(chosen) > 1 else None
 
 

@@ -5,14 +5,12 @@ N is the number of Gaussians; quaternions are wxyz and need not be unit.
 
 import dataclasses
 import math
-import os
 import warnings
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax._src import xla_bridge
 from jax.typing import ArrayLike, DTypeLike
 from scipy.spatial import cKDTree
 
@@ -31,31 +29,6 @@ from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.numerics import safe_divide, safe_sqrt
 from a2tg_jax.core.pytree import pytree
 from a2tg_jax.core.sh import NUM_BASES
-
-_forked_from: set[int] = set()
-"""Identifiers of processes that were forked after JAX had started their devices."""
-
-
-def _note_devices() -> None:
-    # The function is not public; without it, nothing is checked.
-    if getattr(xla_bridge, "backends_are_initialized", bool)():
-        _forked_from.add(os.getpid())
-
-
-if hasattr(os, "register_at_fork"):  # not on Windows, which has no fork
-    os.register_at_fork(before=_note_devices)
-
-
-def check_process() -> None:
-    """Raise RuntimeError, rather than hang, if this process was forked after JAX had started its devices."""
-    # Only children, which inherit the set, lack JAX's threads.
-    if _forked_from - {os.getpid()}:
-        raise RuntimeError(
-            "this process was forked from one in which JAX had started, and waits for its threads forever: start "
-            'processes by spawn, as in multiprocessing.get_context("spawn").Pool(), with functions of a module, not of '
-            "a notebook"
-        )
-
 
 INITIAL_OPACITY = 0.1
 MOST_ROUNDING = 0.1
@@ -150,7 +123,6 @@ def floats_per_gaussian(sh_degree: int = 3) -> int:
 
 def check_gaussians(gaussians: Gaussians, name: str = "gaussians") -> None:
     """Raise ValueError, naming the field, unless all fields have their shapes and one dtype, float32 or float64."""
-    check_process()
     if not isinstance(gaussians, Gaussians):
         raise ValueError(f"{name} must be Gaussians; got {type(gaussians).__name__}")
     names = [field.name for field in dataclasses.fields(gaussians)]

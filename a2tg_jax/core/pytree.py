@@ -14,8 +14,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.host.text import name_replace
-
 T = TypeVar("T")
 MARK = "_registered_pytree"
 
@@ -106,7 +104,7 @@ def pytree(cls: Any = None, /, **options: Any) -> Any:
     own_equality = vars(cls).get("__eq__", _are_equal)
     made = dataclasses.dataclass(frozen=True, **options)(cls)
     made.__eq__ = own_equality
-    name_replace(made)
+    _name_replace(made)
     kinds: dict[str, list[str]] = {"static": [], "beside": [], "dynamic": []}
     for field in dataclasses.fields(made):
         kind = next((kind for kind in ("static", "beside") if field.metadata.get(kind)), "dynamic")
@@ -142,6 +140,23 @@ def pytree(cls: Any = None, /, **options: Any) -> Any:
     jax.tree_util.register_pytree_with_keys(made, flatten_with_keys, unflatten, flatten)
     setattr(made, MARK, made)
     return made
+
+
+def _name_replace(cls: Any) -> None:
+    """Let the error of an assignment to a field say how to make a changed copy."""
+    refuse = cls.__setattr__
+
+    def __setattr__(self: Any, name: str, value: object) -> None:
+        try:
+            refuse(self, name, value)
+        except dataclasses.FrozenInstanceError:
+            names = [field.name for field in dataclasses.fields(self)]
+            hint = f"make a changed copy: dataclasses.replace(old, {name}=...)"
+            if name not in names:
+                hint = f"it has no field {name}, only {', '.join(names)}"
+            raise dataclasses.FrozenInstanceError(f"{type(self).__name__} cannot be changed; {hint}") from None
+
+    cls.__setattr__ = __setattr__
 
 
 def _are_equal(self: Any, other: Any) -> Any:

@@ -99,17 +99,21 @@ def named_if_full(path: Path) -> Iterator[None]:
 
 def left_over(folder: Path) -> dict[Path, Path]:
     """Return the partial files of a folder, with the files they were to become."""
-    names = [PARTIAL.fullmatch(name) for name in os.listdir(folder)] if folder.is_dir() else []
-    return {folder / name[0]: folder / name[1] for name in names if name}
+    partials = {}
+    for name in os.listdir(folder) if folder.is_dir() else ():
+        match = PARTIAL.fullmatch(name)
+        if match:
+            partials[folder / name] = folder / match[1]
+    return partials
 
 
 def is_left_over(partial: Path) -> bool:
     """Return whether the process of a partial file was one of this machine and has ended, or has not written to it for
     an hour."""
-    name = PARTIAL.fullmatch(partial.name)
-    assert name is not None, "one of `left_over`"
-    is_here = name[3] in (None, platform.node())
-    has_ended = is_here and not psutil.pid_exists(int(name[2]))
+    match = PARTIAL.fullmatch(partial.name)
+    assert match is not None, "one of `left_over`"
+    is_here = match[3] in (None, platform.node())
+    has_ended = is_here and not psutil.pid_exists(int(match[2]))
     return has_ended or time.time() - partial.stat().st_mtime > STALE_SECONDS
 
 

@@ -34,11 +34,12 @@ def error_text(error: Exception, less_memory: str) -> str | None:
         return str(error) if isinstance(error, ValueError | OSError) else None
     if not isinstance(error.filename, str | os.PathLike):
         return "the disk is full: make room, or write to another disk"
-    inodes = room = ""
+    details = ""
     path = Path(error.filename).absolute()
-    with contextlib.suppress(OSError):
-        # The file's folder may be missing.
-        free = shutil.disk_usage(next(above for above in (path, *path.parents) if above.is_dir())).free
-        if error.errno == errno.ENOSPC:  # Free bytes say nothing about a quota.
-            inodes, room = " or has no inodes left" if free > PLENTY else "", f", {free / 1e6:.1f} MB are free"
-    return f"{error.filename}: the disk is full{inodes}{room}: make room, or write to another disk"
+    if error.errno == errno.ENOSPC:  # Free bytes say nothing about a quota.
+        with contextlib.suppress(OSError):
+            # The file's folder may be missing.
+            free = shutil.disk_usage(next(above for above in (path, *path.parents) if above.is_dir())).free
+            inodes = " or has no inodes left" if free > PLENTY else ""
+            details = f"{inodes}, {free / 1e6:.1f} MB are free"
+    return f"{error.filename}: the disk is full{details}: make room, or write to another disk"

@@ -39,8 +39,9 @@ def parse_json(text: str | bytes, *, allow_nan: bool = False) -> Any:
     data = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
     _check_size(data, MOST_BYTES)
     # Brackets in texts count as well: a bound that needs no parsing.
-    if (found := data.count(b"[") + data.count(b"{")) > MOST_BRACKETS:
-        raise ValueError(f"it has {found:,} brackets; the limit is {MOST_BRACKETS:,}")
+    num_brackets = data.count(b"[") + data.count(b"{")
+    if num_brackets > MOST_BRACKETS:
+        raise ValueError(f"it has {num_brackets:,} brackets; the limit is {MOST_BRACKETS:,}")
 
     def number(digits: str) -> float:
         value = float(digits)
@@ -85,19 +86,16 @@ def read_object(file: Path) -> dict[str, Any]:
 
 
 def number_of(value: object, what: str) -> float:
-    """Return a number in a file, which some programs write as a text, such as "105.6". ValueError, naming it `what`:
-    it is none."""
-    number = value
+    """Return a number in a file, which some programs write as a text, such as "105.6". Raises ValueError, naming it
+    `what`, for any other value."""
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value)
     if isinstance(value, str):
         with contextlib.suppress(ValueError):
             number = float(value)
-    if (
-        isinstance(number, bool)
-        or not isinstance(number, int | float)
-        or (number is not value and not math.isfinite(number))
-    ):
-        raise ValueError(f"{what} must be a number; got {shortened(repr(value))}")
-    return float(number)
+            if math.isfinite(number):
+                return number
+    raise ValueError(f"{what} must be a number; got {shortened(repr(value))}")
 
 
 def parse_toml(data: bytes) -> dict[str, Any]:
@@ -126,10 +124,12 @@ def _parsed(parse: Callable[[], Any]) -> Any:
     with contextlib.suppress(RecursionError):  # json and tomllib recurse.
         value = parse()
         # Level by level, because a recursive walk might overflow the stack itself.
-        level = [value]
+        level = [value] if isinstance(value, dict | list) else []
         for _ in range(DEEPEST):
-            lists = [list(held.values()) if isinstance(held, dict) else held for held in level]
-            level = [one for held in lists if isinstance(held, list) for one in held if isinstance(one, dict | list)]
+            deeper: list[Any] = []
+            for container in level:
+                deeper += container.values() if isinstance(container, dict) else container
+            level = [inner for inner in deeper if isinstance(inner, dict | list)]
             if not level:
                 return value
     raise ValueError(f"its brackets are nested more than {DEEPEST} deep")

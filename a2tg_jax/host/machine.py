@@ -106,8 +106,10 @@ def cpu_quota(root: Path = Path("/")) -> float:
             if (folder / "cpu.max").is_file():
                 quota, period = (folder / "cpu.max").read_text().split()
             else:  # version 1
-                quota, period = ((folder / f"cpu.cfs_{name}_us").read_text() for name in ("quota", "period"))
-            quotas += [int(quota) / int(period)] if int(quota) > 0 else []  # -1 is no limit.
+                quota = (folder / "cpu.cfs_quota_us").read_text()
+                period = (folder / "cpu.cfs_period_us").read_text()
+            if int(quota) > 0:  # -1 is no limit.
+                quotas.append(int(quota) / int(period))
     return min(quotas)
 
 
@@ -198,8 +200,10 @@ def keep_room_for_programs(processes: Path = Path("/proc")) -> bool:
 
 def processor_features(file: Path = Path("/proc/cpuinfo")) -> frozenset[str]:
     """Return the processor's features as Linux lists them; macOS and Windows list none."""
-    lines = file.read_text().splitlines() if file.exists() else []
-    return frozenset(next((line.split(":", 1)[1].split() for line in lines if line.startswith("flags")), []))
+    for line in file.read_text().splitlines() if file.exists() else ():
+        if line.startswith("flags"):
+            return frozenset(line.partition(":")[2].split())
+    return frozenset()
 
 
 def processor_key() -> str:
@@ -225,15 +229,15 @@ class Machine:
 
     def differences(self, now: "Machine") -> list[str]:
         """Return the differences to another machine that affect the last bits, with a remedy if there is one."""
-        found = [
-            f"{name} is {getattr(now, name)} and was {getattr(self, name)}"
-            for name in ("jax", "jaxlib", "device", "processor")
-            if getattr(self, name) != getattr(now, name)
-        ]
+        differences = []
+        for name in ("jax", "jaxlib", "device", "processor"):
+            before = getattr(self, name)
+            if before != getattr(now, name):
+                differences.append(f"{name} is {getattr(now, name)} and was {before}")
         if self.threads != now.threads and now.device.startswith("cpu"):
             remedy = f"{VARIABLE}={self.threads} keeps them"
-            found.append(f"there are {now.threads} threads and were {self.threads} ({remedy})")
-        return found
+            differences.append(f"there are {now.threads} threads and were {self.threads} ({remedy})")
+        return differences
 
 
 @dataclasses.dataclass(frozen=True)

@@ -88,7 +88,8 @@ def _read_header(file: IO[bytes], name: str) -> tuple[np.dtype, bool, tuple[int,
     if length > LONGEST_HEADER:
         raise ValueError(f"{name} has a header of {length} bytes")
     header: Any = ast.literal_eval(file.read(length).decode())
-    dtype, shape = np.dtype(header["descr"]), header["shape"]
+    dtype = np.dtype(header["descr"])
+    shape = header["shape"]
     if dtype.kind not in "biuf" or dtype.itemsize > 8 or dtype.shape:  # Arrays of objects are pickles.
         raise ValueError(f"{name} must be of plain numbers; got {dtype}")
     # True is no size. NumPy before 2.0 has at most 32 dimensions.

@@ -130,7 +130,8 @@ def has_display() -> bool:
 
 def cuda_of_driver() -> tuple[int, int] | None:
     """Return the newest CUDA version that the NVIDIA driver supports; None without a driver."""
-    number, library = ctypes.c_int(), "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
+    number = ctypes.c_int()
+    library = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
     try:
         ctypes.CDLL(library).cuDriverGetVersion(ctypes.byref(number))
     except (OSError, AttributeError):

@@ -5,8 +5,8 @@ from typing import Any
 
 
 def optional(module: str, need: str, extra: str) -> Any:
-    """Import and return a module. ValueError: it is not installed; `need` says what for, as in "a mesh needs
-    scikit-image", and `extra` is the extra of this package that brings it."""
+    """Import and return a module. Raises ValueError if it is not installed: `need` says what it is for, as in "a mesh
+    needs scikit-image", and `extra` is the extra of this package that installs it."""
     try:
         return importlib.import_module(module)
     except ImportError as error:

@@ -12,8 +12,10 @@ from typing import Any, TypeVar
 
 from tqdm import tqdm
 
-PLAIN_SHARE, PLAIN_SECONDS = 0.1, 3.0
-"""Share of the whole, and seconds, between plain lines."""
+PLAIN_SHARE = 0.1
+"""Least share of the whole between plain lines."""
+PLAIN_SECONDS = 3.0
+"""Least time between plain lines, in seconds."""
 
 TICK = 0.5
 """Seconds between looks at what another program has done."""
@@ -112,17 +114,21 @@ class PlainCounter:
     """Number `n` of finished items, as tqdm has it, in plain lines on stderr."""
 
     def __init__(self, title: str, total: int | None):
-        self._title, self._total, self.n = title, total, 0
+        self.n = 0
+        self._title = title
+        self._total = total
         self._began = time.perf_counter()
-        self._last_line = 0, self._began
+        self._printed = 0
+        self._printed_at = self._began
 
     def update(self, num: int = 1) -> None:
         """Count items."""
         self.n += num
-        if is_line_due(self.n, self._total or 0, *self._last_line):
+        if is_line_due(self.n, self._total or 0, self._printed, self._printed_at):
             of_total = f" of {self._total:,}" if self._total else ""
             print(f"{self._title}: {self.n:,}{of_total}{self._left}", file=sys.stderr, flush=True)
-            self._last_line = self.n, time.perf_counter()
+            self._printed = self.n
+            self._printed_at = time.perf_counter()
 
     @property
     def _left(self) -> str:

@@ -12,10 +12,14 @@ from pathlib import Path
 
 MOST_ARRAY_BYTES = 1 << 34
 """Largest file of arrays: models, checkpoints, weights, point clouds and COLMAP's models."""
-LARGEST_RATIO, FREE_ROOM = 64, 1 << 20
-"""Largest growth of an untrusted file that is unpacked: a multiple of its size, and bytes that any file may have."""
-LFS_POINTER, MOST_POINTER_BYTES = b"version https://git-lfs.github.com/spec/", 1024
-"""Beginning and size limit of the text that git-lfs leaves for a file (https://github.com/git-lfs/git-lfs, spec)."""
+LARGEST_RATIO = 64
+"""Largest growth of an untrusted file that is unpacked, as a multiple of its size."""
+FREE_ROOM = 1 << 20
+"""Bytes that any file may unpack to."""
+LFS_POINTER = b"version https://git-lfs.github.com/spec/"
+"""Beginning of the text that git-lfs leaves for a file (https://github.com/git-lfs/git-lfs, spec)."""
+MOST_POINTER_BYTES = 1024
+"""Largest size of that text."""
 URL = re.compile(r"[A-Za-z][\w+.:-]+://")
 READING = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 """Flags to open a file for reading bytes, without waiting for a pipe's writer or changing newlines."""

@@ -27,7 +27,8 @@ class Stopped(KeyboardInterrupt):
         advice: how to continue the stopped work.
         """
         super().__init__(signal.Signals(number).name)
-        self.number, self.advice = int(number), advice
+        self.number = int(number)
+        self.advice = advice
 
     @staticmethod
     def of(interrupt: KeyboardInterrupt) -> "Stopped":
@@ -58,31 +59,34 @@ def noted(numbers: tuple[int, ...] = ENDING) -> Iterator[Callable[[], bool]]:
     Yield a function that returns whether there was a signal. Programs that handle a signal themselves keep their
     handler.
     """
-    found: list[int] = []
+    received: list[int] = []
 
     def note(number: int, frame: object) -> None:
-        found.append(number)
-        if len(found) > 1:
+        received.append(number)
+        if len(received) > 1:
             raise Stopped(number)
 
-    default = (signal.default_int_handler, signal.SIG_DFL)
-    before = {number: signal.getsignal(number) for number in numbers}
-    # Handlers of this module belong to an outer block.
-    own = tuple(n for n, old in before.items() if old in default or getattr(old, "__module__", None) == __name__)
-    with _handled_by(note, own):
+    with _handled_by(note, tuple(number for number in numbers if _is_ours(signal.getsignal(number)))):
         try:
-            yield lambda: bool(found)
-        except KeyboardInterrupt as stop:
-            if found:  # The interrupt keeps its class and gets the number of the signal.
-                stop.number = found[-1]  # type: ignore[attr-defined]
+            yield lambda: bool(received)
+        except KeyboardInterrupt as interrupt:
+            if received:  # The interrupt keeps its class and gets the number of the signal.
+                interrupt.number = received[-1]  # type: ignore[attr-defined]
             raise
-    if found:
-        raise Stopped(found[-1])
+    if received:
+        raise Stopped(received[-1])
+
+
+def _is_ours(handler: object) -> bool:
+    """Return whether a handler is Python's default, or of an outer block of this module."""
+    default = (signal.default_int_handler, signal.SIG_DFL)
+    return handler in default or getattr(handler, "__module__", None) == __name__
 
 
 def _send(number: int) -> None:
     """Send a signal to the main thread, which stops waiting; Windows has no such call."""
-    if hasattr(signal, "pthread_kill") and (main := threading.main_thread().ident) is not None:
+    main = threading.main_thread().ident
+    if hasattr(signal, "pthread_kill") and main is not None:
         signal.pthread_kill(main, number)
     else:
         signal.raise_signal(number)

@@ -26,7 +26,7 @@ def source_commit() -> str | None:
             return done.stdout.strip()
         if given is not None:
             return given
-        noted = distribution("a2tg-jax").read_text("direct_url.json")
-        return json.loads(noted).get("vcs_info", {}).get("commit_id") if noted else None
+        recorded = distribution("a2tg-jax").read_text("direct_url.json")
+        return json.loads(recorded).get("vcs_info", {}).get("commit_id") if recorded else None
     except (OSError, subprocess.SubprocessError, PackageNotFoundError):
         return given

@@ -79,9 +79,10 @@ def silence_xla() -> None:
 
 def add_xla_flags(flags: tuple[str, ...]) -> None:
     """Append flags to the environment's XLA_FLAGS, except flags that are set already."""
-    own = os.environ.get("XLA_FLAGS", "").split()
-    taken = {flag.split("=", 1)[0] for flag in own}
-    os.environ["XLA_FLAGS"] = " ".join(own + [flag for flag in flags if flag.split("=", 1)[0] not in taken])
+    kept = os.environ.get("XLA_FLAGS", "").split()
+    names = {flag.partition("=")[0] for flag in kept}
+    kept += [flag for flag in flags if flag.partition("=")[0] not in names]
+    os.environ["XLA_FLAGS"] = " ".join(kept)
 
 
 def cache_folder() -> Path:

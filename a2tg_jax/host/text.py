@@ -1,6 +1,5 @@
 """Short texts for messages."""
 
-import dataclasses
 import difflib
 import shlex
 from collections.abc import Iterable, Sequence
@@ -36,9 +35,10 @@ def as_argument(path: Path) -> str:
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """Return "; did you mean KNOWN?" for the known name closest to a misspelt one, or several that are as close; empty
     if none is close."""
-    close = sorted(difflib.get_close_matches(name, known, n=3))
-    likeness = [difflib.SequenceMatcher(None, each, name).ratio() for each in close]
-    closest = [each for each, ratio in zip(close, likeness, strict=True) if ratio == max(likeness)]
+    likeness = {}
+    for close in sorted(difflib.get_close_matches(name, known, n=3)):
+        likeness[close] = difflib.SequenceMatcher(None, close, name).ratio()
+    closest = [close for close, ratio in likeness.items() if ratio == max(likeness.values())]
     return f"; did you mean {' or '.join(closest)}?" if closest else ""
 
 
@@ -54,28 +54,20 @@ def first_names(names: Sequence[str], most: int = 5) -> str:
 
 def in_bytes(num: float) -> str:
     """Return a number of bytes with three digits in bytes, kB, MB or GB (10^9 bytes)."""
-    size, text = float(num), counted(round(num), "byte")
-    for unit in ("kB", "MB", "GB"):
-        if size < 999.5:  # 999.5 is printed as 1,000.
-            break
+    if num < 999.5:  # 999.5 is printed as 1,000.
+        return counted(round(num), "byte")
+    size = float(num)
+    for unit in ("kB", "MB"):
         size /= 1e3
-        # Numbers are rounded up to 10.0 from 9.995 on, and to 100 from 99.95 on: three digits in any case.
-        text = f"{size:,.{2 if size < 9.995 else 1 if size < 99.95 else 0}f} {unit}"
-    return text
+        if size < 999.5:
+            return f"{_three_digits(size)} {unit}"
+    return f"{_three_digits(size / 1e3)} GB"
 
 
-def name_replace(cls: Any) -> None:
-    """Let the error of an assignment to a field of a frozen dataclass say how to make a changed copy."""
-    refuse = cls.__setattr__
-
-    def __setattr__(self: Any, name: str, value: object) -> None:
-        try:
-            refuse(self, name, value)
-        except dataclasses.FrozenInstanceError:
-            names = [field.name for field in dataclasses.fields(self)]
-            hint = f"make a changed copy: dataclasses.replace(old, {name}=...)"
-            if name not in names:
-                hint = f"it has no field {name}, only {', '.join(names)}"
-            raise dataclasses.FrozenInstanceError(f"{type(self).__name__} cannot be changed; {hint}") from None
-
-    cls.__setattr__ = __setattr__
+def _three_digits(number: float) -> str:
+    # Numbers are rounded up to 10.0 from 9.995 on, and to 100 from 99.95 on.
+    if number < 9.995:
+        return f"{number:.2f}"
+    if number < 99.95:
+        return f"{number:.1f}"
+    return f"{number:,.0f}"

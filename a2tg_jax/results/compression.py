@@ -4,7 +4,6 @@ the choices tried."""
 import dataclasses
 import functools
 import math
-import shlex
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated
@@ -27,7 +26,6 @@ from a2tg_jax.finish.compaction import (
     try_choices,
 )
 from a2tg_jax.finish.tuning import (
-    ITERATIONS,
     MOST_TUNINGS,
     TUNED_LADDER,
     Tune,
@@ -44,8 +42,9 @@ from a2tg_jax.io.formats import FORMATS
 from a2tg_jax.io.model_rows import check_encodable
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderSettings
-from a2tg_jax.results.folder import RunFolder, check_export, check_output
+from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.model_source import open_source
+from a2tg_jax.results.output_paths import check_export, check_output
 from a2tg_jax.results.report import aligned, loss_text
 from a2tg_jax.results.run_evaluation import refined_views
 from a2tg_jax.training import System
@@ -119,61 +118,70 @@ def compress(
       ValueError, OSError: if the model or the photographs for tuning are missing, the file exists, a compact file
         cannot hold the model, no file is within the loss or the bytes, or an option is invalid.
     """
-    name, max_bytes, tune_iterations = source.name.lower(), options.max_bytes, options.tune_iterations
+    name = source.name.lower()
     if not source.is_dir() and name.endswith(tuple(FORMATS)) and not name.endswith(".npz"):
-        done = ", which is compressed already" if name.endswith(SUFFIX) else ""
-        raise ValueError(f"a2tg compress reads a run folder or *.npz; got {shortened(str(source))}{done}")
+        hint = ", which is compressed already" if name.endswith(SUFFIX) else ""
+        raise ValueError(f"a2tg compress reads a run folder or *.npz; got {shortened(str(source))}{hint}")
     options.check()
+    max_bytes = options.max_bytes
+    num_iterations = options.tune_iterations
     if out is not None and (out.is_dir() or out.suffix.lower() != SUFFIX):
         raise ValueError(f"out must be the path of a file that ends in {SUFFIX}; got {out}")
     opened = open_source(source)
-    model, default = opened.model, opened.path.with_suffix(SUFFIX)
+    model = opened.model
+    default = opened.path.with_suffix(SUFFIX)
     out = default if out is None else out
     check_output(out)
-    check_export(out, default, "--out", overwrite=overwrite)
+    check_export(out, default, "`out`", overwrite=overwrite)
     # Before the photographs are loaded, and minutes of trials.
     check_encodable(model.appearance)
-    ladder = TUNED_LADDER if tune_iterations else LADDER
+    ladder = TUNED_LADDER if num_iterations else LADDER
     if max_bytes is not None:
         check_fits(model, max_bytes, ladder)
-    scene, tune = scene or opened.load_scene(), None
-    if tune_iterations:
+    scene = scene or opened.load_scene()
+    tune = None
+    if num_iterations:
         if opened.system is None:
             raise ValueError(f"tune_iterations needs the photographs of a run folder; {source} is a file")
         if scene is None:
             raise FileNotFoundError(f"tune_iterations needs the photographs of {source}, which are missing")
-        tune = functools.partial(_tuned, scene, opened.system, tune_iterations, progress)
+        tune = functools.partial(_tuned, scene, opened.system, num_iterations, progress)
     losses = loss_measures(model, scene, opened.settings)
     if not losses:
         raise ValueError(
             "the model has no cameras to measure a loss with; use save_compact in Python with your own choices"
         )
     measures = list(losses.values())
+    num_ways = sum(map(len, ladder.values()))
     tunings = f", then training up to {MOST_TUNINGS} times" if tune else ""
-    ways = f"up to {sum(map(len, ladder.values()))} ways to round the model's numbers"
-    print(f"trying {ways}{tunings}; on a CPU this takes minutes", flush=True)
+    print(
+        f"trying up to {num_ways} ways to round the model's numbers{tunings}; on a CPU this takes minutes", flush=True
+    )
     trials = measure_choices(model, measures, ladder, progress=progress)
-    untuned, found = _search(model, measures, options.most_loss, max_bytes, trials, tune)
-    chosen, data = _better(model, untuned, found, options.most_loss, max_bytes)
+    untuned, tuned = _search(model, measures, options.most_loss, max_bytes, trials, tune)
+    chosen, data = _better(model, untuned, tuned, options.most_loss, max_bytes)
     # Only the default path is listed in the marker: any other file is the user's.
     if source.is_dir() and out == default:
         RunFolder(source).own(out)
     write_whole(out, data)
-    share = f"1/{model.num_bytes / chosen.num_bytes:.1f} of the model's numbers"
-    size = f"{out}: {in_bytes(chosen.num_bytes)} on disk, {share}, {loss_text(chosen.losses[0])}"
-    lines = _table(trials, found, chosen, losses) if verbose else []
-    if found.diverged:
-        lines.append(f"tuning ended early, what was found before is kept: {found.diverged}")
-    if max_bytes is not None and found.tried and found.chosen is None:
-        best = f"the best of {len(found.tried)} has {in_bytes(min(trial.num_bytes for trial in found.tried))}"
+    lines = _table(trials, tuned, chosen, losses) if verbose else []
+    return "\n".join([*lines, *_notes(tuned, max_bytes), _result(out, model, chosen)])
+
+
+def _notes(tuned: TunedFiles, max_bytes: int | None) -> list[str]:
+    """Return lines about a tuning that did not lead to the file."""
+    lines = []
+    if tuned.diverged:
+        lines.append(f"tuning ended early, what was found before is kept: {tuned.diverged}")
+    if max_bytes is not None and tuned.tried and tuned.chosen is None:
+        best = f"the best of {len(tuned.tried)} has {in_bytes(min(trial.num_bytes for trial in tuned.tried))}"
         lines.append(f"no tuned file is small enough, {best}: the untuned one is kept")
-    return "\n".join([*lines, size])
+    return lines
 
 
-def command_for_file(run: RunFolder, size: str) -> str:
-    """Return the command line that writes the tuned file of a size of a finished run."""
-    flags = ["--file-budget", size, "--tune-iterations", str(ITERATIONS)]
-    return shlex.join(["a2tg", "compress", str(run.path), *flags])
+def _result(out: Path, model: Model, chosen: Trial) -> str:
+    share = f"1/{model.num_bytes / chosen.num_bytes:.1f} of the model's numbers"
+    return f"{out}: {in_bytes(chosen.num_bytes)} on disk, {share}, {loss_text(chosen.losses[0])}"
 
 
 def _search(
@@ -181,36 +189,41 @@ def _search(
     tune: Tune | None,
 ) -> tuple[Trial | None, TunedFiles]:  # fmt: skip
     """Return the best file without tuning, and tuned ones; within bytes if they are given, or else within a loss."""
+    tuned = TunedFiles([])
     if max_bytes is not None:
         untuned = try_choices(model, best_within(model, max_bytes, trials), measures)
-        return untuned, TunedFiles([]) if tune is None else best_tuned(model, measures, max_bytes, trials, tune)
+        if tune is not None:
+            tuned = best_tuned(model, measures, max_bytes, trials, tune)
+        return untuned, tuned
+    within = None
     try:
         within = smallest_within(model, measures, max_loss, trials)
     except TooMuchLostError:
         # Rounding alone may lose too much. With tuning, that is no error yet.
         if tune is None:
             raise
-        within = None
-    return within, TunedFiles([]) if tune is None else smallest_tuned(model, measures, max_loss, trials, tune)
+    if tune is not None:
+        tuned = smallest_tuned(model, measures, max_loss, trials, tune)
+    return within, tuned
 
 
-def _table(trials: Sequence[Trial], found: TunedFiles, chosen: Trial, measures: Iterable[str]) -> list[str]:
+def _table(trials: Sequence[Trial], tuned: TunedFiles, chosen: Trial, measures: Iterable[str]) -> list[str]:
     """Return lines: a table of all choices tried, then the bits of the tuned files and the chosen one."""
-    named = [(f"{trial.group} {trial.precision}", trial) for trial in trials]
-    named += [(f"tuned {number}", trial) for number, trial in enumerate(found.tried, 1)]
-    named.append(("chosen", chosen))
-    rows = [["kept as", "bytes", *(f"dB lost, {measure}" for measure in measures)]]
-    rows += [[name, f"{trial.num_bytes:,}", *(f"{loss:.3f}" for loss in trial.losses)] for name, trial in named]
-    groups = {trial.group for trial in trials}
-    bits = []
-    for name, trial in named[len(trials) :]:
-        kept = ", ".join(f"{group} {getattr(trial.choices, group)}" for group in GROUPS if group in groups)
-        bits.append(f"{name}: {kept}")
-    return [*aligned(list(zip(*rows, strict=True))), *bits]
+    files = {f"tuned {number}": trial for number, trial in enumerate(tuned.tried, 1)} | {"chosen": chosen}
+    names = [f"{trial.group} {trial.precision}" for trial in trials]
+    rows = [("kept as", "bytes", *(f"dB lost, {measure}" for measure in measures))]
+    for name, trial in zip([*names, *files], [*trials, *files.values()], strict=True):
+        rows.append((name, f"{trial.num_bytes:,}", *(f"{loss:.3f}" for loss in trial.losses)))
+    lines = aligned(list(zip(*rows, strict=True)))
+    tried = {trial.group for trial in trials}
+    groups = [group for group in GROUPS if group in tried]
+    for name, trial in files.items():
+        lines.append(f"{name}: " + ", ".join(f"{group} {getattr(trial.choices, group)}" for group in groups))
+    return lines
 
 
 def _better(
-    model: Model, untuned: Trial | None, found: TunedFiles, max_loss: float, max_bytes: int | None
+    model: Model, untuned: Trial | None, files: TunedFiles, max_loss: float, max_bytes: int | None
 ) -> tuple[Trial, bytes]:
     """Return the untuned or the tuned file: the one that loses less if bytes are given, or else the smaller one. Raises
     TooMuchLostError if there is neither."""
@@ -218,14 +231,15 @@ def _better(
     def rank(trial: Trial) -> float:
         return trial.num_bytes if max_bytes is None else trial.losses[0]
 
-    tuned = found.chosen
-    if found.tuned is not None and tuned is not None and (untuned is None or rank(tuned) < rank(untuned)):
-        return tuned, found.tuned.data
+    chosen = files.chosen
+    if chosen is not None and files.tuned is not None and (untuned is None or rank(chosen) < rank(untuned)):
+        return chosen, files.tuned.data
     if untuned is not None:
         return untuned, encode_model(model, untuned.choices)
-    least = min((trial.losses[0] for trial in found.tried), default=None)
-    best = "" if least is None else f"; the best tuned file loses {least:.3f} dB"
-    ended = f"; tuning ended early: {found.diverged}" if found.diverged else ""
+    best = ""
+    if files.tried:
+        best = f"; the best tuned file loses {min(trial.losses[0] for trial in files.tried):.3f} dB"
+    ended = f"; tuning ended early: {files.diverged}" if files.diverged else ""
     raise TooMuchLostError(f"max_loss must be larger: no file, tuned or not, is within it; got {max_loss}{best}{ended}")
 
 
@@ -241,11 +255,13 @@ def loss_measures(model: Model, scene: Scene | None, settings: RenderSettings) -
     without photographs and cameras."""
     if scene is not None:
         # Held-out views are measured as well, but never decide.
-        views = {"training views": refined_views(scene.train, model), "test views": scene.test}
-        chosen = {name: evenly_chosen(found, MOST_VIEWS) for name, found in views.items() if found}
-        return {name: loss_on_views(model, found, settings=settings) for name, found in chosen.items()}
+        views_by_name = {"training views": refined_views(scene.train, model), "test views": scene.test}
+        measures = {}
+        for name, views in views_by_name.items():
+            if views:
+                measures[name] = loss_on_views(model, evenly_chosen(views, MOST_VIEWS), settings=settings)
+        return measures
     if model.origin is None or not model.origin.names:
         return {}
-    cameras = model.origin.training_cameras
-    cameras = evenly_chosen(cameras, MOST_VIEWS)
+    cameras = evenly_chosen(model.origin.training_cameras, MOST_VIEWS)
     return {f"for a model of {ASSUMED_PSNR:g} dB": loss_beside_renders(model, cameras, settings=settings)}

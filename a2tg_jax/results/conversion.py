@@ -7,7 +7,6 @@ import os
 import time
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.finish.baking import ITERATIONS, MOST_GROWTH, MOST_VIEWS, bake, likeness, pictures
@@ -29,8 +28,9 @@ from a2tg_jax.io.other_programs import World, world_line
 from a2tg_jax.io.ply import save_ply
 from a2tg_jax.io.sog import HEADER
 from a2tg_jax.model import Model
-from a2tg_jax.results.folder import RunFolder, check_new, check_output
+from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.model_source import Source, open_source
+from a2tg_jax.results.output_paths import check_new, check_output
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,9 +82,10 @@ def convert(
     check_conversion(source, out, placement, overwrite=overwrite)  # Baking takes minutes.
     start = time.perf_counter()
     opened = open_source(source, name, edit)
-    model, baked = _kept_or_baked(source, opened, baking, edit) if baking.bake else (opened.model, "")
-    lines = [baked] if baked else []
-    return "\n".join([*lines, write_converted(opened.path, model, out, start, placement)])
+    if not baking.bake:
+        return write_converted(opened.path, opened.model, out, start, placement)
+    model, line = _kept_or_baked(source, opened, baking, edit)
+    return f"{line}\n{write_converted(opened.path, model, out, start, placement)}"
 
 
 def check_conversion(
@@ -129,12 +130,16 @@ def write_converted(
         save_ply(out, model, float64=True, world=world)
     else:
         save_splats(out, model, world=world)
-    before, after, seconds = file_bytes(source_file), file_bytes(out), time.perf_counter() - start
+    before = file_bytes(source_file)
+    after = file_bytes(out)
+    seconds = time.perf_counter() - start
     sizes = f"{in_bytes(after)} from {in_bytes(before)} ({after / max(before, 1):.2f} times)"
     lines = [f"{out}: {counted(model.num, 'Gaussian')}, {sizes}, {seconds:.1f} s"]
-    if lost := lost_by(model, out):
+    lost = lost_by(model, out)
+    if lost:
         lines.append(f"not kept by this format: {', '.join(lost)}")
-    if unseen := unseen_elsewhere(model, out):
+    unseen = unseen_elsewhere(model, out)
+    if unseen:
         lines.append(f"not shown by other programs: {unseen}")
     if not format_of(out).keeps_origin:
         lines.append(world_line(model, world))
@@ -152,12 +157,17 @@ def _kept_or_baked(source: Path, opened: Source, options: BakeOptions, edit: Pat
         return _baked(source, opened.model, options)
     run = RunFolder(source)
     path = run.baked(opened.path.stem)
-    key: dict[str, Any] = {"sha256": sha256_of(opened.path), "version": version("a2tg-jax")}
-    key |= dataclasses.asdict(options) | {"edit": None if edit is None else sha256_of(edit)}
+    key = {
+        "sha256": sha256_of(opened.path),
+        "version": version("a2tg-jax"),
+        **dataclasses.asdict(options),
+        "edit": None if edit is None else sha256_of(edit),
+    }
     with contextlib.suppress(ValueError, OSError, KeyError, TypeError):  # Damaged: baked again.
-        kept = read_archive_header(path, format=FORMAT)["baked"] if is_regular(path) else {}
-        if kept.get("key") == key:
-            return load_model(path), f"{kept['line']}; kept in {path}"
+        if is_regular(path):
+            kept = read_archive_header(path, format=FORMAT)["baked"]
+            if kept["key"] == key:
+                return load_model(path), f"{kept['line']}; kept in {path}"
     plain, line = _baked(source, opened.model, options)
     if plain is not opened.model:
         with contextlib.suppress(OSError):  # A run may be read-only.
@@ -169,19 +179,19 @@ def _baked(source: Path, model: Model, options: BakeOptions) -> tuple[Model, str
     """Return a plain model, and a line about the baking."""
     if model.origin is None or not model.origin.cameras:
         raise ValueError(f"`bake` needs a model with cameras; {source} has none")
-    shown = model.appearance
-    if shown.is_portable and shown.texture is None and shown.exponents is None:
+    appearance = model.appearance
+    if appearance.is_portable and appearance.texture is None and appearance.exponents is None:
         return model, "baked: nothing, because the model is plain"
-    training, held_out = model.origin.training_cameras, model.origin.held_out_cameras
+    training = model.origin.training_cameras
     plain = bake(model, training, growth=options.bake_growth, iterations=options.bake_iterations, progress=True)
     # The bake has not seen held-out cameras, so that they judge it fairly.
-    views = held_out or training
-    views = evenly_chosen(views, MOST_VIEWS)
+    held_out = model.origin.held_out_cameras
+    views = evenly_chosen(held_out or training, MOST_VIEWS)
     likeness_db = likeness(pictures(plain, views), pictures(model, views))
-    degree, ratio = plain.gaussians.sh_degree, plain.num_bytes / model.num_bytes
-    numbers = f"{counted(model.num, 'splat')} into {plain.num:,} plain ones of SH degree {degree}"
-    judged = counted(len(views), f"{'held-out' if held_out else 'training'} view")
-    return (
-        plain,
-        f"baked: {numbers}, {ratio:.2f} times the numbers' bytes, {likeness_db:.1f} dB against the model in {judged}",
+    splats = counted(model.num, "splat")
+    judged = counted(len(views), "held-out view" if held_out else "training view")
+    return plain, (
+        f"baked: {splats} into {plain.num:,} plain ones of SH degree {plain.gaussians.sh_degree}, "
+        f"{plain.num_bytes / model.num_bytes:.2f} times the numbers' bytes, {likeness_db:.1f} dB against the model in "
+        f"{judged}"
     )

@@ -16,8 +16,8 @@ from a2tg_jax.host.text import did_you_mean
 from a2tg_jax.io.edit_file import Edit, apply_edit, crop_box, save_edit
 from a2tg_jax.model import Model
 from a2tg_jax.results.conversion import check_conversion, write_converted
-from a2tg_jax.results.folder import check_new, check_output
 from a2tg_jax.results.model_source import open_source
+from a2tg_jax.results.output_paths import check_new, check_output
 
 AXES = dict(zip("xyz", np.eye(3), strict=True))
 AXES |= {f"-{name}": -axis for name, axis in AXES.items()}
@@ -50,7 +50,8 @@ class EditOptions:
         if self.crop is not None:
             low, high = np.array([_shares(text) for text in self.crop]).T
             # Like the sliders, upright by the vertical that the edit leads to.
-            crop = crop_box(model, (model.origin or Origin.of_cameras([])).vertical if up is None else up, low, high)
+            vertical = _origin_of(model).vertical if up is None else up
+            crop = crop_box(model, vertical, low, high)
         return Edit(crop, self.floaters / 100, up, None if self.background is None else _color(self.background))
 
 
@@ -59,7 +60,8 @@ def write_edit(
 ) -> str:
     """Write an edit as *.json, or a source's edited model in any format that `convert` writes, and return a summary.
     Arguments and errors otherwise as in `convert`."""
-    is_edit, start = out.suffix.lower() == ".json", time.perf_counter()
+    start = time.perf_counter()
+    is_edit = out.suffix.lower() == ".json"
     if is_edit:
         check_output(out)
         check_new(out, "`out`", overwrite=overwrite)
@@ -75,8 +77,13 @@ def write_edit(
 
 
 def _shares(text: str) -> tuple[float, float]:
-    found = re.fullmatch(r"(\d+(?:\.\d+)?):(\d+(?:\.\d+)?)", text)
-    low, high = map(float, found.groups()) if found else (1.0, 0.0)
+    """Return the ends of a range such as 35:65 as shares."""
+    low = 1.0
+    high = 0.0
+    match = re.fullmatch(r"(\d+(?:\.\d+)?):(\d+(?:\.\d+)?)", text)
+    if match:
+        low = float(match[1])
+        high = float(match[2])
     if not 0 <= low < high <= 100:
         raise ValueError(
             "`crop` must be LOW:HIGH for width, depth and height, percentages from 0 to 100, LOW below HIGH; got "
@@ -85,15 +92,21 @@ def _shares(text: str) -> tuple[float, float]:
     return low / 100, high / 100
 
 
+def _origin_of(model: Model) -> Origin:
+    return model.origin or Origin.of_cameras([])
+
+
 def _vertical(text: str, model: Model) -> np.ndarray:
     """Return the vertical [3] in a model's world that an axis of the original world or a photograph names."""
-    origin = model.origin or Origin.of_cameras([])
+    origin = _origin_of(model)
     if text in AXES:
         return origin.transform.rotation @ AXES[text]
-    if text not in origin.names:
-        near = did_you_mean(text, origin.names) or (f"; the first is {origin.names[0]}" if origin.names else "")
-        raise ValueError(f"`upright` must be x, -x, y, -y, z, -z or a photograph of the model; got {text!r}{near}")
-    return vertical_in(origin.viewmats[origin.names.index(text)], origin.vertical)
+    if text in origin.names:
+        return vertical_in(origin.viewmats[origin.names.index(text)], origin.vertical)
+    hint = did_you_mean(text, origin.names)
+    if not hint and origin.names:
+        hint = f"; the first is {origin.names[0]}"
+    raise ValueError(f"`upright` must be x, -x, y, -y, z, -z or a photograph of the model; got {text!r}{hint}")
 
 
 def _color(text: str) -> Color:

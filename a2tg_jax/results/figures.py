@@ -4,8 +4,8 @@ They use matplotlib's object interface, without windows or global state.
 """
 
 import dataclasses
-import io
 import itertools
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -15,19 +15,17 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from PIL import Image
 
-from a2tg_jax.core.camera_paths import smooth_path, without_outlying
-from a2tg_jax.core.cameras import Camera, resize_camera
+from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.data.colmap import read_cameras_and_points
-from a2tg_jax.host.atomic import replacing, write_whole
+from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.text import PROGRAM
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.folder import RunFolder
-from a2tg_jax.results.images import checkered, save_animation, save_picture, to_uint8
+from a2tg_jax.results.images import checkered, save_picture, to_uint8
 from a2tg_jax.texture import texture_arrays
 from a2tg_jax.training import History
 
@@ -43,16 +41,19 @@ CURVES = (
     ("num_gaussians", "Gaussians"),
     ("megabytes", "Memory (MB)"),
 )
-NUM_TEXTURES, TEXTURE_SIDE, TEXTURE_MARGIN, TEXTURES_PER_ROW = 24, 64, 8, 8
+NUM_TEXTURES = 24
+TEXTURES_PER_ROW = 8
+TEXTURE_SIDE = 64
+"""Side of a texture in the sheet, in pixels."""
+TEXTURE_MARGIN = 8
 LEAST_ALPHA = 0.5
 """Smallest alpha that shows a depth and a normal."""
-DEPTH_RANGE = 5, 95
+DEPTH_RANGE = (5, 95)
 """Percentiles of the inverse depths at the ends of the colour scale."""
 DEPTH_STOPS = 5
 """Number of depths in the legend."""
 NUM_CHECKERS = 60
 """Squares across a picture's empty parts."""
-FLIGHT_FRAMES, FLIGHT_PER_SECOND, FLIGHT_SIDE = 60, 15, 480
 MOST_CLOUD_POINTS = 20_000
 """Largest number of points drawn."""
 WIDEST = 3.0
@@ -78,44 +79,41 @@ def write_figures(
 ) -> dict[str, list[ReportFigure]]:  # fmt: skip
     """Write the figures of a run's main model, some of them from one camera, and return them by their places in the
     report. `starts` has the number of iterations before each stage."""
-    found: dict[str, list[ReportFigure]] = {"curves": [], "textures": [], "maps": [], "geometry": [], "flight": []}
 
-    def add(
-        place: str, name: str, content: Figure | np.ndarray | bytes, caption: str, kind: str = "",
+    def written(
+        name: str, content: Figure | np.ndarray, caption: str, kind: str = "",
         legend: Sequence[tuple[str, str]] = (),
-    ) -> None:  # fmt: skip
+    ) -> ReportFigure:  # fmt: skip
         path = run.own(run.figures / name)
         if isinstance(content, Figure):
             save_figure(path, content)
-        elif isinstance(content, bytes):
-            write_whole(path, content)
         else:
             save_picture(path, content)
-        found[place].append(ReportFigure(path, caption, kind, legend))
+        return ReportFigure(path, caption, kind, legend)
 
+    figures: dict[str, list[ReportFigure]] = {"curves": [], "textures": [], "maps": [], "geometry": []}
     caption = "Loss and PSNR of the training views seen, with running means."
-    add("curves", "curves.png", curves_figure(histories, starts), caption, "chart")
+    figures["curves"].append(written("curves.png", curves_figure(histories, starts), caption, "chart"))
     if model.textures is not None and (model.textures.sizes.prod(axis=1) > 1).any():
-        learned = learned_textures(model)
-        if learned is not None:
+        sheet = learned_textures(model)
+        if sheet is not None:
             caption = "Some of the most visible textures, in their Gaussians' colours; chequered where transparent."
-            add("textures", "textures.png", learned, caption, "texels")
+            figures["textures"].append(written("textures.png", sheet, caption, "texels"))
         caption = "Number of Gaussians with a texture of each resolution."
-        add("textures", "sizes.png", sizes_figure(model.textures.sizes), caption, "chart")
-    for file, varying, levels, names in level_maps(model):
-        legend = list(zip(map(to_hex, level_colors(len(names))), names, strict=True))
+        figures["textures"].append(written("sizes.png", sizes_figure(model.textures.sizes), caption, "chart"))
+    for name, varying, levels, meanings in level_maps(model):
+        legend = list(zip(map(to_hex, level_colors(len(meanings))), meanings, strict=True))
         caption = f"The first view, every Gaussian by {varying}; {NOT_HIT}."
-        add("maps", file, level_picture(model, levels, camera, settings), caption, legend=legend)
+        picture = level_picture(model, levels, camera, settings)
+        figures["maps"].append(written(name, picture, caption, legend=legend))
     output = Renderer(model, settings=settings)(camera)
     picture, stops = depth_picture(output)
     legend = [(to_hex(tuple(color)), f"{distance:.3g}") for distance, color in stops]
     caption = "Depth in units of the normalised world; nearer and farther depths have the colours of the ends"
-    add("geometry", "depth.png", picture, f"{caption}; {NOT_HIT}.", legend=legend)
+    figures["geometry"].append(written("depth.png", picture, f"{caption}; {NOT_HIT}.", legend=legend))
     caption = f"Normals: red to the right, green up, blue to the camera; {NOT_HIT}."
-    add("geometry", "normals.png", normal_picture(output, camera), caption)
-    if (moving := flight(model, settings)) is not None:
-        add("flight", "flight.webp", moving, "A flight past the cameras.", "figure")
-    return found
+    figures["geometry"].append(written("normals.png", normal_picture(output, camera), caption))
+    return figures
 
 
 def save_figure(path: Path, figure: Figure) -> None:
@@ -131,12 +129,15 @@ def curves_figure(histories: Mapping[str, History], starts: Mapping[str, int]) -
     colors = dict(zip(histories, itertools.cycle(COLORS), strict=False))
     for axes, (field, title) in zip(figure.subplots(2, 2).flat, CURVES, strict=True):
         for name, history in histories.items():
-            x, y = _thinned(starts[name] + history.iteration), _thinned(getattr(history, field))
+            x = _thinned(starts[name] + history.iteration)
+            y = _thinned(getattr(history, field))
             if field in ("loss", "psnr") and len(y) >= 2 * RUNNING_MEANS:
                 # Loss and PSNR jump from view to view: the curve is pale, with its running mean over it.
                 axes.plot(x, y, color=colors[name], alpha=0.2, linewidth=0.8)
-                window = len(y) // RUNNING_MEANS
-                x, y = (np.convolve(column, np.full(window, 1 / window), mode="valid") for column in (x, y))
+                width = len(y) // RUNNING_MEANS
+                window = np.full(width, 1 / width)
+                x = np.convolve(x, window, mode="valid")
+                y = np.convolve(y, window, mode="valid")
             axes.plot(x, y, color=colors[name], label=name, linewidth=1.6)
         for border in sorted({start for start in starts.values() if start}):
             axes.axvline(border, color="black", linestyle="--", linewidth=0.8)
@@ -152,15 +153,20 @@ def curves_figure(histories: Mapping[str, History], starts: Mapping[str, int]) -
 
 def _thinned(column: np.ndarray) -> np.ndarray:
     """Return means of equally many rows of a column, at most `MOST_POINTS`; a remainder at the end is dropped."""
-    rows = -(-len(column) // MOST_POINTS)
-    return column if rows < 2 else column[: len(column) // rows * rows].reshape(-1, rows).mean(axis=1)
+    rows = math.ceil(len(column) / MOST_POINTS)
+    if rows < 2:
+        return column
+    num = len(column) // rows
+    return column[: num * rows].reshape(num, rows).mean(axis=1)
 
 
 def sizes_figure(sizes: np.ndarray) -> Figure:
     """Plot the number of Gaussians by the resolution of their textures, sizes [N, 2], as a map of Tv × Tu."""
     # Textures grow by doubling their sides.
     sides = 2 ** np.arange(int(np.log2(max(4, sizes.max()))) + 1)
-    counts = np.array([[np.sum((sizes == (tv, tu)).all(axis=1)) for tu in sides] for tv in sides])
+    counts = np.zeros((len(sides), len(sides)), int)
+    for row, column in np.ndindex(*counts.shape):
+        counts[row, column] = np.sum((sizes == (sides[row], sides[column])).all(axis=1))
     figure = Figure(figsize=(1.2 + 0.95 * len(sides), 0.9 + 0.75 * len(sides)), layout="constrained")
     axes = figure.add_subplot()
     shown = np.log10(1.0 + counts)  # Most Gaussians have the smallest size; others would be invisible.
@@ -193,23 +199,27 @@ def learned_textures(model: Model) -> np.ndarray | None:
         return None
     texels = texture_arrays(texture.shown())[: model.num]
     areas = np.exp(np.asarray(model.gaussians.log_scales)[: model.num].sum(axis=1))
-    spread = np.asarray([own.reshape(-1, 4).var(axis=0).sum() if own.size > 4 else 0.0 for own in texels])
+    # The variance of a single texel is 0.
+    spread = np.asarray([texture.reshape(-1, 4).var(axis=0).sum() if texture.size else 0.0 for texture in texels])
     order = [index for index in np.argsort(-areas * spread)[:NUM_TEXTURES] if spread[index] > 0]
     if not order:
         return None
     colors = 0.5 + SH_C0 * np.asarray(model.gaussians.sh)[:, 0]
     step = TEXTURE_SIDE + TEXTURE_MARGIN
-    rows, columns = -(-len(order) // TEXTURES_PER_ROW), min(len(order), TEXTURES_PER_ROW)
+    rows = math.ceil(len(order) / TEXTURES_PER_ROW)
+    columns = min(len(order), TEXTURES_PER_ROW)
     sheet = np.zeros((rows * step - TEXTURE_MARGIN, columns * step - TEXTURE_MARGIN, 4), np.uint8)
     for place, index in enumerate(order):
         # A whole factor: every texel stays a sharp square.
         scale = TEXTURE_SIDE // max(texels[index].shape[:2])
         large = np.kron(texels[index], np.ones((scale, scale, 1)))  # [h, w, 4]: RGB residual and alpha factor
-        alpha, color = np.clip(large[..., 3:], 0, 1), np.clip(colors[index] + large[..., :3], 0, 1)
+        alpha = np.clip(large[..., 3:], 0, 1)
+        color = np.clip(colors[index] + large[..., :3], 0, 1)
         picture = to_uint8(alpha * color + (1 - alpha) * checkered(large.shape[:2], TEXTURE_SIDE // 8))
-        top, left = (step * number for number in divmod(place, TEXTURES_PER_ROW))
-        target = sheet[top : top + picture.shape[0], left : left + picture.shape[1]]
-        target[..., :3], target[..., 3] = picture, 255
+        row, column = divmod(place, TEXTURES_PER_ROW)
+        target = sheet[row * step :, column * step :][: picture.shape[0], : picture.shape[1]]
+        target[..., :3] = picture
+        target[..., 3] = 255
     return sheet
 
 
@@ -284,23 +294,6 @@ def _ground(shape: tuple[int, ...]) -> np.ndarray:
     return checkered(shape, max(1, shape[1] // NUM_CHECKERS))
 
 
-def flight(model: Model, settings: RenderSettings) -> bytes | None:
-    """Return a small animation (WebP) of a smooth flight past the model's cameras; None with fewer than two."""
-    cameras = [] if model.origin is None else list(model.origin.cameras)
-    if len(cameras) < 2:
-        return None
-    path = []
-    for camera in smooth_path(without_outlying(cameras), FLIGHT_FRAMES):
-        scale = min(1.0, FLIGHT_SIDE / max(camera.width, camera.height))
-        path.append(resize_camera(camera, *(max(1, round(scale * side)) for side in (camera.width, camera.height))))
-    # Capacity is planned from some of the cameras, and grows if another needs more.
-    renderer = Renderer(model, cameras=path[::10], settings=settings, has_geometry=False)
-    buffer = io.BytesIO()
-    pictures = (Image.fromarray(to_uint8(renderer(camera).color)) for camera in path)
-    save_animation(buffer, pictures, FLIGHT_PER_SECOND, quality=75, method=2)
-    return buffer.getvalue()
-
-
 # Cameras of a scene
 
 
@@ -326,14 +319,13 @@ def save_camera_picture(scene: Path, path: Path) -> None:
     reach = 1.1 * max(far_cameras, min(far_points, WIDEST * far_cameras), 1e-9)
     step = max(1, len(cloud.points) // MOST_CLOUD_POINTS)
     figure = Figure(figsize=(11, 5.5), layout="constrained")
-    for panel, rows, title in zip(
-        figure.subplots(1, 2), ([0, 1], [0, 2]), ("from above", "from the side"), strict=True
-    ):
-        plane = axes[rows]
+    planes = {"from above": axes[[0, 1]], "from the side": axes[[0, 2]]}
+    for panel, (title, plane) in zip(figure.subplots(1, 2), planes.items(), strict=True):
         x, y = plane @ (cloud.points[::step] - middle).T
         panel.scatter(x, y, s=1, c=cloud.colors[::step] / 255, linewidths=0)
         # Cameras are joined in the order of their names; short lines are their viewing directions.
-        places, ahead = plane @ (centers - middle).T, plane @ rotations[:, 2].T * (0.06 * reach)
+        places = plane @ (centers - middle).T
+        ahead = plane @ rotations[:, 2].T * (0.06 * reach)
         panel.plot(*places, color=COLORS[2], linewidth=0.5, alpha=0.5)
         panel.plot(*np.stack([places, places + ahead], axis=1), color=COLORS[1], linewidth=0.8)
         panel.scatter(places[0], places[1], s=8, color=COLORS[0], zorder=3)

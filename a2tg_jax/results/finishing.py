@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import functools
 import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -18,9 +17,11 @@ from a2tg_jax.host.regular_files import is_regular, sha256_of
 from a2tg_jax.io.model_file import load_model, save_model
 from a2tg_jax.measure.evaluation import evaluate
 from a2tg_jax.model import Model
+from a2tg_jax.results.finish_record import FinishOptions
 from a2tg_jax.results.folder import RunFolder, check_free, claimed, write_json
 from a2tg_jax.results.model_source import finished_stage, settings_of
-from a2tg_jax.results.record import FinishOptions, PlannedStage, write_record
+from a2tg_jax.results.plan import PlannedStage
+from a2tg_jax.results.record import RunRecord, write_record
 from a2tg_jax.results.report import aligned
 from a2tg_jax.results.run_evaluation import evaluate_run, finished_stages, refined_views
 from a2tg_jax.training.registry import system_to_dict
@@ -53,52 +54,68 @@ def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_we
     """
     options.check()
     record, planned = finished_stage(source)
-    path, run = source.model(planned.name), RunFolder(out)
+    name = planned.name
+    run = RunFolder(out)
     # The checksum ties finish.json to this model: a run trained again is another source.
-    origin = {"source": str(source.path.resolve()), "model": planned.name, "sha256": sha256_of(path)}
+    origin = {"source": str(source.path.resolve()), "model": name, "sha256": sha256_of(source.model(name))}
     content = {**origin, **dataclasses.asdict(options)}
     _is_written(run, content)
-    model, scene = load_model(path), record.scene.load()
-    can_polish = options.polish_steps > 0 and model.appearance.is_linear
-    if can_polish and planned.system.exposure:  # Photographs of changing exposure would pull at the colours.
+    model = load_model(source.model(name))
+    scene = record.scene.load()
+    shrinks = options.max_loss > 0 and can_shrink(model)
+    polishes = options.polish_steps > 0 and model.appearance.is_linear
+    if polishes and planned.system.exposure:  # Photographs of changing exposure would pull at the colours.
         raise ValueError("the run learned exposures, which polishing does not support: add `polish_steps` 0")
-    if not can_polish and not (options.max_loss and can_shrink(model)):
-        raise ValueError(f"{planned.name} has nothing that these options can shrink or polish")
+    if not polishes and not shrinks:
+        raise ValueError(f"{name} has nothing that these options can shrink or polish")
     # Raises before any work if a model that the evaluation needs is missing.
     finished_stages(source, record.plan)
     # Each change is made and measured; before them the model is measured, and at the end the run.
-    num_steps = 2 + 2 * (bool(options.max_loss and can_shrink(model)) + can_polish)
+    num_steps = 2 + 2 * (shrinks + polishes)
     with claimed(run), counting("finish", num_steps, "step") as counter:
         is_written = _is_written(run, content)  # Another process may have been here meanwhile.
-        changed = [("finished", load_model(run.model(planned.name)))] if is_written else _changed(model, scene, options)
-        models, steps = {"before": model}, {"before": _measured(model, scene, planned)}
+        models = {"before": model}
+        steps = {"before": _measured(model, scene, planned)}
         counter.update()
-        for name, after in changed:
+        changed = iter([("finished", load_model(run.model(name)))]) if is_written else _changed(model, scene, options)
+        for step, after in changed:
             counter.update()
-            models[name], steps[name] = after, _measured(after, scene, planned)
+            models[step] = after
+            steps[step] = _measured(after, scene, planned)
             counter.update()
         if not is_written:
             # A process that was killed before the record may have left files.
             run.clear()
             write_json(run.own(run.finish), content)
-            for name in record.plan.names:
-                # The report compares all models of the run: the others are copied.
-                for find in (RunFolder.model, RunFolder.history):
-                    if find(source, name).is_file() and find(source, name) != path:
-                        with replacing(run.own(find(run, name))) as copy:
-                            shutil.copyfile(find(source, name), copy)
-            system = {"system": system_to_dict(planned.system)}
-            save_model(run.own(run.model(planned.name)), models[kept_step(steps)], system)
+            _copy_other_models(source, run, record)
+            kept = models[kept_step(steps)]
+            save_model(run.own(run.model(name)), kept, {"system": system_to_dict(planned.system)})
             write_record(run, record)  # Last: it makes the folder a run.
         evaluate_run(run, scene, lpips_weights=lpips_weights)
         counter.update()
+    return _table(steps)
+
+
+def _copy_other_models(source: RunFolder, run: RunFolder, record: RunRecord) -> None:
+    """Copy the models and histories of a run, which the report compares, except the finished model."""
+    copies = [(source.history(name), run.history(name)) for name in record.plan.names]
+    copies += [(source.model(name), run.model(name)) for name in record.plan.names if name != record.plan.main[-1]]
+    for path, copy in copies:
+        if path.is_file():
+            with replacing(run.own(copy)) as temporary:
+                shutil.copyfile(path, temporary)
+
+
+def _table(steps: Mapping[str, Measured]) -> str:
     columns = [("", "bytes", "train PSNR (dB)", "held-out PSNR (dB)")]
-    for name, found in steps.items():
-        test = "" if found.test is None else f"{found.test:.2f}"
-        columns.append((name, f"{found.num_bytes:,}", f"{found.train:.2f}", test))
+    for name, measured in steps.items():
+        test = "" if measured.test is None else f"{measured.test:.2f}"
+        columns.append((name, f"{measured.num_bytes:,}", f"{measured.train:.2f}", test))
+    lines = aligned(columns)
     kept = kept_step(steps)
-    spoiled = [] if kept == name else [f"kept: {kept}, for polishing lost PSNR on the training views"]
-    return "\n".join([*aligned(columns), *spoiled])
+    if kept != list(steps)[-1]:
+        lines.append(f"kept: {kept}, for polishing lost PSNR on the training views")
+    return "\n".join(lines)
 
 
 def _is_written(run: RunFolder, content: Mapping[str, object]) -> bool:
@@ -117,8 +134,7 @@ def _changed(model: Model, scene: Scene, options: FinishOptions) -> Iterator[tup
     """Yield the name of each step and the model after it."""
     views = refined_views(scene.train, model)
     if options.max_loss and can_shrink(model):
-        some = evenly_chosen(views, MOST_VIEWS)
-        model = shrink_textures(model, some, max_loss=options.max_loss)
+        model = shrink_textures(model, evenly_chosen(views, MOST_VIEWS), max_loss=options.max_loss)
         yield "shrunk", model
     if options.polish_steps and model.appearance.is_linear:
         yield "polished", polish(model, views, num_steps=options.polish_steps)
@@ -132,5 +148,6 @@ def kept_step(steps: Mapping[str, Measured]) -> str:
 
 
 def _measured(model: Model, scene: Scene, planned: PlannedStage) -> Measured:
-    measure = functools.partial(evaluate, gaussians=model, settings=settings_of(planned.system))
-    return Measured(model.num_bytes, measure(scene.train).psnr, measure(scene.test).psnr if scene.test else None)
+    settings = settings_of(planned.system)
+    test = evaluate(scene.test, model, settings=settings).psnr if scene.test else None
+    return Measured(model.num_bytes, evaluate(scene.train, model, settings=settings).psnr, test)

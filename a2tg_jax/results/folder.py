@@ -1,4 +1,4 @@
-"""The run folder: its layout, and which existing files and folders may be replaced.
+"""The run folder: its layout, the marker that lists its files, its lock, and its replacement by another run.
 
     RUN/
       .a2tg-run                  the marker: a list of the files that this program wrote there
@@ -11,7 +11,7 @@
       tensorboard/events.*       the same for TensorBoard, with --tensorboard
       metrics.json, per_view.json
       test/NAME.png              photograph, renders and error side by side
-      figures/                   curves, texture resolutions, some textures, depth, normals, a flight
+      figures/                   curves, texture resolutions, some textures, depth, normals
       point_cloud.ply            the Gaussians, upright, for other programs
       viewer.html                the model in a browser, on one page
       report.html                everything on one page
@@ -26,37 +26,34 @@ import contextlib
 import glob
 import json
 import os
-import shlex
-import sys
-import tempfile
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from a2tg_jax.data.other_runs import model_hint
-from a2tg_jax.host.atomic import file_to_write, left_over, named_if_full, write_whole
-from a2tg_jax.host.machine import ALONE, Devices
+from a2tg_jax.host.atomic import left_over, named_if_full, write_whole
 from a2tg_jax.host.operating_system import flush_folder, try_lock
 from a2tg_jax.host.regular_files import is_regular, read_regular
-from a2tg_jax.io.archive import read_archive_header
-from a2tg_jax.io.config_json import config_from_dict
 
 # If the newest is damaged, training continues from the one before.
 KEPT_CHECKPOINTS = 2
 MARKER = "a2tg-jax run"
-DAMAGED = ".damaged"
-OLD = ".a2tg-old"
-EXPORTS = (".a2tgz", ".glb")
-"""Suffixes of optional files that `a2tg compress` and `a2tg mesh` write into a run folder."""
-IN_USE = "is not empty; add `resume` to continue it, `overwrite` to start again, or choose another `out`"
-"""Error text of training for a folder that already holds a run."""
+"""First line of a marker."""
 MOST_NAMES = 100_000
 """Largest number of files in a marker."""
 MOST_MARKER_BYTES = 1 << 24
+DAMAGED = ".damaged"
+"""Suffix added to the name of a damaged checkpoint."""
+OLD = ".a2tg-old"
+IN_USE = "is not empty; add `resume` to continue it, `overwrite` to start again, or choose another `out`"
+"""Error text of training for a folder that already holds a run."""
 
 
 class RunFolder:
-    """Paths within one run folder."""
+    """Paths within one run folder, and its marker: the list of files that runs wrote there.
+
+    Only listed files are ever replaced or deleted.
+    """
 
     def __init__(self, path: Path):
         self.path = path
@@ -72,78 +69,6 @@ class RunFolder:
         self.figures = path / "figures"
         self.test = path / "test"
 
-    def own(self, path: Path) -> Path:
-        """Return the path after listing it in the marker. Only listed paths are ever replaced or deleted.
-
-        A link to a file outside is removed, with a warning: a run folder may come from a stranger.
-        """
-        self.own_all([path.relative_to(self.path).as_posix()])
-        if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(self.path.resolve()):
-            target = os.readlink(path)
-            warnings.warn(f"{path} was a link to {target}, which stays: runs write into their own folder", stacklevel=2)
-            path.unlink()
-        return path
-
-    def own_all(self, names: Sequence[str]) -> None:
-        """List several files in the marker at once, by names relative to the folder."""
-        known = set(self.written())
-        lines = [f"{name}\n" for name in dict.fromkeys(names) if name not in known]
-        if not lines:
-            return
-        self.path.mkdir(parents=True, exist_ok=True)
-        # Names reach the disk before their files, so that a crash never leaves an unlisted file.
-        with named_if_full(self.marker), open(self.marker, "a", encoding="utf-8") as file:
-            file.writelines(lines if os.fstat(file.fileno()).st_size else [f"{MARKER}\n", *lines])
-            file.flush()
-            os.fsync(file.fileno())
-
-    def written(self) -> list[str]:
-        """Return the paths listed in the marker, relative to the folder; none without a marker. Raises ValueError if it
-        is not a run's marker, or lists more than `MOST_NAMES` files."""
-        if not is_regular(self.marker) or not self.marker.stat().st_size:
-            return []
-        data = read_regular(self.marker, MOST_MARKER_BYTES)
-        first, *names = data.decode("utf-8", errors="replace").splitlines()
-        if first != MARKER:
-            raise ValueError(f"{self.marker} is not the marker of a run; choose another folder with `out`")
-        if len(names) > MOST_NAMES:
-            raise ValueError(
-                f"{self.marker} lists {len(names):,} files, and {MOST_NAMES:,} are the most that a run writes; "
-                "choose another folder with `out`"
-            )
-        return names
-
-    def own_files(self, names: list[str]) -> list[Path]:
-        """Return the paths of names that are files within the folder, except the marker."""
-        root, found = self.path.resolve(), []
-        for path in (self.path / name for name in dict.fromkeys(names)):
-            # A line cut off by a crash may name a folder, a damaged one an impossible path.
-            with contextlib.suppress(OSError):
-                if path != self.marker and path.is_file() and path.resolve().is_relative_to(root):
-                    found.append(path)
-        return found
-
-    def clear(self) -> None:
-        """Delete what runs wrote into their folder, and folders left empty. The marker stays, empty."""
-        for path in self.own_files(self.written()):
-            path.unlink(missing_ok=True)
-            remove_if_empty(path.parent, self.path)
-        if self.marker.is_file():
-            # The same file: it holds the lock of this process.
-            os.truncate(self.marker, 0)
-            self.own(self.marker)
-
-    @property
-    def is_begun(self) -> bool:
-        """Whether a run wrote more than its record."""
-        return any(path != self.record for path in self.own_files(self.written()))
-
-    @property
-    def has_progress(self) -> bool:
-        """Whether there is a checkpoint, a model or the state before a divergence."""
-        files = self.own_files(self.written())
-        return any(path.parent.name in ("checkpoints", "models", "diverged") for path in files)
-
     def model(self, name: str) -> Path:
         return self.path / "models" / f"{name}.npz"
 
@@ -157,11 +82,110 @@ class RunFolder:
     def history(self, name: str) -> Path:
         return self.path / "history" / f"{name}.csv"
 
+    def state(self, name: str) -> Path:
+        return self.path / "states" / f"{name}.npz"
+
     def checkpoint(self, name: str, iteration: int) -> Path:
         return self.path / "checkpoints" / f"{name}-{iteration:010d}.npz"
 
-    def state(self, name: str) -> Path:
-        return self.path / "states" / f"{name}.npz"
+    def diverged(self, name: str, iteration: int) -> Path:
+        return self.path / "diverged" / f"{name}-{iteration:010d}.npz"
+
+    # The marker
+
+    def own(self, path: Path) -> Path:
+        """Return the path after listing it in the marker.
+
+        A link to a file outside is removed, with a warning: a run folder may come from a stranger.
+        """
+        self.own_all([path.relative_to(self.path).as_posix()])
+        if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(self.path.resolve()):
+            target = os.readlink(path)
+            warnings.warn(f"{path} was a link to {target}, which stays: runs write into their own folder", stacklevel=2)
+            path.unlink()
+        return path
+
+    def own_all(self, names: Sequence[str]) -> None:
+        """List several files in the marker at once, by names relative to the folder."""
+        listed = set(self.written())
+        lines = [f"{name}\n" for name in dict.fromkeys(names) if name not in listed]
+        if not lines:
+            return
+        self.path.mkdir(parents=True, exist_ok=True)
+        # Names reach the disk before their files, so that a crash never leaves an unlisted file.
+        with named_if_full(self.marker), open(self.marker, "a", encoding="utf-8") as file:
+            if os.fstat(file.fileno()).st_size == 0:
+                file.write(f"{MARKER}\n")
+            file.writelines(lines)
+            file.flush()
+            os.fsync(file.fileno())
+
+    def written(self) -> list[str]:
+        """Return the names in the marker, relative to the folder; none without a marker. Raises ValueError if it is not
+        a run's marker, or lists more than `MOST_NAMES` files."""
+        if not is_regular(self.marker) or not self.marker.stat().st_size:
+            return []
+        data = read_regular(self.marker, MOST_MARKER_BYTES)
+        first, *names = data.decode("utf-8", errors="replace").splitlines()
+        if first != MARKER:
+            raise ValueError(f"{self.marker} is not the marker of a run; choose another folder with `out`")
+        if len(names) > MOST_NAMES:
+            raise ValueError(
+                f"{self.marker} lists {len(names):,} files, and {MOST_NAMES:,} are the most that a run writes; "
+                "choose another folder with `out`"
+            )
+        return names
+
+    def files(self) -> list[Path]:
+        """Return the paths of listed files that exist within the folder, except the marker."""
+        root = self.path.resolve()
+        files = []
+        for name in dict.fromkeys(self.written()):
+            path = self.path / name
+            # A line cut off by a crash may name a folder, a damaged one an impossible path.
+            with contextlib.suppress(OSError):
+                if path != self.marker and path.is_file() and path.resolve().is_relative_to(root):
+                    files.append(path)
+        return files
+
+    def clear(self) -> None:
+        """Delete what runs wrote into their folder, and folders left empty. The marker stays, empty."""
+        for path in self.files():
+            path.unlink(missing_ok=True)
+            remove_if_empty(path.parent, self.path)
+        if self.marker.is_file():
+            # The same file: it holds the lock of this process.
+            os.truncate(self.marker, 0)
+            self.own(self.marker)
+
+    @property
+    def is_begun(self) -> bool:
+        """Whether a run wrote more than its record."""
+        return any(path != self.record for path in self.files())
+
+    @property
+    def has_progress(self) -> bool:
+        """Whether there is a checkpoint, a model or the state before a divergence."""
+        return any(path.parent.name in ("checkpoints", "models", "diverged") for path in self.files())
+
+    # Checkpoints
+
+    def checkpoints(self, name: str, ending: str = "") -> list[Path]:
+        """Return the checkpoints of a stage, oldest first."""
+        # Iterations have ten digits, so that names sort by number.
+        return sorted((self.path / "checkpoints").glob(f"{glob.escape(name)}-{'[0-9]' * 10}.npz{ending}"))
+
+    def drop_old_checkpoints(self, name: str) -> None:
+        """Delete all checkpoints of a stage but the newest `KEPT_CHECKPOINTS`."""
+        for path in self.checkpoints(name)[:-KEPT_CHECKPOINTS]:
+            path.unlink()
+
+    def drop_all_checkpoints(self, name: str) -> None:
+        """Delete all checkpoints of a stage, damaged ones as well."""
+        for path in [*self.checkpoints(name), *self.checkpoints(name, DAMAGED)]:
+            path.unlink()
+        with contextlib.suppress(OSError):  # Other stages' checkpoints may be in it.
+            (self.path / "checkpoints").rmdir()
 
     def keep_state(self, name: str, iteration: int) -> None:
         """Keep the checkpoint of a stage's last iteration, if it is there, as its state at the end."""
@@ -171,44 +195,10 @@ class RunFolder:
             state.parent.mkdir(exist_ok=True)
             checkpoint.replace(state)
 
-    def diverged(self, name: str, iteration: int) -> Path:
-        return self.path / "diverged" / f"{name}-{iteration:010d}.npz"
-
-    def checkpoints(self, name: str, ending: str = "") -> list[Path]:
-        """Return the checkpoints of a stage, oldest first."""
-        # Iterations have ten digits, so that names sort by number.
-        return sorted((self.path / "checkpoints").glob(f"{glob.escape(name)}-{'[0-9]' * 10}.npz{ending}"))
-
-    def drop_old_checkpoints(self, name: str, keep: int = KEPT_CHECKPOINTS) -> None:
-        """Delete all checkpoints of a stage except the newest `keep`; with keep=0, damaged ones as well."""
-        old = self.checkpoints(name)[: -keep or None]
-        for path in old if keep else [*old, *self.checkpoints(name, DAMAGED)]:
-            path.unlink()
-        if not keep:
-            with contextlib.suppress(OSError):  # Other stages' checkpoints may be in it.
-                (self.path / "checkpoints").rmdir()
-
 
 def iteration_of(checkpoint: Path) -> int:
     """Return the iteration after which a checkpoint was written."""
     return int(checkpoint.stem.rpartition("-")[2])
-
-
-def check_free(path: Path, *, overwrite: bool = False, in_use: str = IN_USE) -> None:
-    """Raise FileExistsError if `path` is anything but a free folder, which may hold the run.toml of a run that never
-    began, or a run that may be replaced (`overwrite`). `in_use` is the error text for a run."""
-    if path.exists() and not path.is_dir():
-        raise FileExistsError(f"{path} is a file; choose another folder with `out`")
-    run = RunFolder(path)
-    # A process killed early leaves a marker, a record or partial files: nothing worth keeping.
-    unused = {run.marker.name, run.record.name} if run.marker.is_file() else set()
-    unused |= {partial.name for partial, whole in left_over(path).items() if whole.name in run.written()}
-    if not path.is_dir() or all(entry.name in unused for entry in path.iterdir()):
-        return
-    if not run.written():
-        raise FileExistsError(f"{path} is not empty and not a run folder; choose another folder with `out`")
-    if not overwrite:
-        raise FileExistsError(f"{path} {in_use}")
 
 
 def open_run(path: Path) -> RunFolder:
@@ -226,21 +216,26 @@ def runs_in(folder: Path) -> list[RunFolder]:
     return [run for run in map(RunFolder, entries) if run.record.is_file()]
 
 
-def resuming_command(run: RunFolder, devices: Devices | None = None) -> str:
-    """Return the command line that continues a training on these devices; None: its newest checkpoint's devices."""
-    if devices is None:
-        devices = ALONE
-        # By time: checkpoints of several stages do not sort by name.
-        found = sorted((run.path / "checkpoints").glob("*.npz"), key=lambda path: path.stat().st_mtime_ns)
-        with contextlib.suppress(ValueError, OSError):  # It may be damaged.
-            kept = read_archive_header(found[-1]).get("devices", {}) if found else {}
-            devices = config_from_dict(Devices, kept, "devices")
-    words = ["a2tg", "train", "--out", str(run.path), "--resume"]
-    if devices != ALONE:
-        words += ["--devices", str(devices.each)]
-    if devices.processes > 1:
-        words += ["--coordinator", "HOST:PORT", "--num-processes", str(devices.processes), "--process-id", "I"]
-    return shlex.join(words)
+def check_free(path: Path, *, overwrite: bool = False, in_use: str = IN_USE) -> None:
+    """Raise FileExistsError if `path` is anything but a free folder, which may hold the run.toml of a run that never
+    began, or a run that may be replaced (`overwrite`). `in_use` is the error text for a run."""
+    if not path.exists():
+        return
+    if not path.is_dir():
+        raise FileExistsError(f"{path} is a file; choose another folder with `out`")
+    run = RunFolder(path)
+    written = run.written()
+    # A process killed early leaves a marker, a record or partial files: nothing worth keeping.
+    unused = {run.marker.name, run.record.name} if run.marker.is_file() else set()
+    for partial, whole in left_over(path).items():
+        if whole.name in written:
+            unused.add(partial.name)
+    if all(entry.name in unused for entry in path.iterdir()):
+        return
+    if not written:
+        raise FileExistsError(f"{path} is not empty and not a run folder; choose another folder with `out`")
+    if not overwrite:
+        raise FileExistsError(f"{path} {in_use}")
 
 
 def remove_if_empty(folder: Path, root: Path) -> None:
@@ -271,10 +266,10 @@ def claimed(run: RunFolder) -> Iterator[None]:
         run.own(run.marker)
         put_back_old(run)
         # Only partial files of listed files: others may be of another program.
-        own = {run.path / name for name in run.written()}
-        for folder in {path.parent for path in own}:
-            for partial, path in left_over(folder).items():
-                if path in own:
+        listed = {run.path / name for name in run.written()}
+        for folder in {path.parent for path in listed}:
+            for partial, whole in left_over(folder).items():
+                if whole in listed:
                     partial.unlink(missing_ok=True)
         yield
 
@@ -313,7 +308,7 @@ def put_back_old(run: RunFolder) -> bool:
     old = old_run(run)
     if old is None:
         return False
-    if not old.own_files(old.written()):
+    if not old.files():
         drop_old(run)  # A process was killed before the first move.
         return False
     is_moving = not run.record.is_file()
@@ -332,86 +327,18 @@ def drop_old(run: RunFolder) -> None:
     if old is not None:
         old.clear()
         old.marker.unlink(missing_ok=True)
-        if not any(old.path.iterdir()):
-            old.path.rmdir()
+        remove_if_empty(old.path, run.path)
 
 
 def _move(source: RunFolder, target: RunFolder, *, is_record_first: bool) -> None:
-    names = source.written()
-    target.own_all(names)
-    paths = sorted(source.own_files(names), key=lambda path: (path == source.record) != is_record_first)
-    for path in paths:
+    target.own_all(source.written())
+    for path in sorted(source.files(), key=lambda path: (path == source.record) != is_record_first):
         moved = target.path / path.relative_to(source.path)
         moved.parent.mkdir(parents=True, exist_ok=True)
         os.replace(path, moved)
         remove_if_empty(path.parent, source.path)
     # Renames reach the disk before the old marker is emptied.
     flush_folder(target.path)
-
-
-# Checks of output paths, before any work
-
-
-def check_output(path: Path) -> None:
-    """Raise ValueError, or OSError of a link, if a file or folder cannot be made, naming the obstacle.
-
-    Several levels of new folders outside the current one, such as on a misspelt drive, are reported on stderr.
-    """
-    place = Path(os.path.abspath(file_to_write(path)))
-    missing = [folder for folder in (place, *place.parents) if not folder.exists()]
-    existing = missing[-1].parent if missing else place if place.is_dir() else place.parent
-    if not existing.exists():
-        raise ValueError(f"{path} cannot be made, because there is no {existing}")
-    if not existing.is_dir():
-        raise ValueError(f"{path} cannot be made, because {existing} is a file")
-    try:
-        # Trying is the only sure test: permissions, read-only mounts and network drives differ.
-        os.rmdir(tempfile.mkdtemp(dir=existing))
-    except OSError as error:
-        raise ValueError(f"{path} cannot be made, because {existing} is not writable: {error.strerror}") from None
-    if len(missing) > 1 and not existing.is_relative_to(os.getcwd()):
-        print(f"a2tg: {missing[-1]} does not exist and will be made", file=sys.stderr)
-
-
-def check_apart(out: Path, other: Path) -> None:
-    """Raise ValueError if one of two paths, at least one of which is written, is in the other."""
-    # Links resolved: names alone do not show an overlap.
-    one = Path(os.path.realpath(out))
-    two = Path(os.path.realpath(other))
-    if one.is_relative_to(two) or two.is_relative_to(one):
-        raise ValueError(f"{out} and {other} overlap: choose an output folder outside it")
-
-
-def check_new(path: Path, option: str, *, overwrite: bool) -> None:
-    """Raise if a file must not be replaced, naming it and its option: FileExistsError if it exists and `overwrite` is
-    not set, ValueError if it belongs to a run and is no export."""
-    if not path.is_file():
-        return
-    run = _run_that_wrote(path)
-    if run is not None and path.suffix.lower() not in EXPORTS:
-        raise ValueError(f"{path} belongs to the run in {run}; choose another {option}")
-    if not overwrite:
-        raise FileExistsError(f"{path} exists; add `overwrite` to replace it, or choose another {option}")
-
-
-def check_export(path: Path, default: Path, option: str, *, overwrite: bool) -> None:
-    """Call `check_new`, unless the path is the default and an earlier call wrote it into a run folder."""
-    if os.path.realpath(path) != os.path.realpath(default) or _run_that_wrote(path) is None:
-        check_new(path, option, overwrite=overwrite)
-
-
-def _run_that_wrote(path: Path) -> Path | None:
-    """Return the folder of the run that lists a file as its own, or None."""
-    path = Path(os.path.realpath(path))
-    names = {folder: path.relative_to(folder).as_posix() for folder in path.parents}
-    return next((folder for folder, name in names.items() if name in RunFolder(folder).written()), None)
-
-
-def check_not_source(files: Iterable[Path], source: Path, option: str) -> None:
-    """Raise ValueError, naming the file and its option, if a file to write is the source."""
-    for file in files:
-        if file.exists() and source.exists() and file.samefile(source):
-            raise ValueError(f"{file} is the model itself; choose another {option}")
 
 
 # JSON

@@ -8,10 +8,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from a2tg_jax.data.photo_store import SHARE_OF_MEMORY
-from a2tg_jax.data.scene import Scene
+from a2tg_jax.data.scene import Scene, View
 from a2tg_jax.host.machine import allowed_memory, default_platform
 from a2tg_jax.host.text import in_bytes
-from a2tg_jax.results.record import MEMORY_OF_FILE, RunPlan, RunRecord
+from a2tg_jax.results.commands import QUICK_SIDE, quick_flags
+from a2tg_jax.results.plan import RunPlan
+from a2tg_jax.results.record import MEMORY_OF_FILE, RunRecord
 from a2tg_jax.training.cost import (
     COMPILER,
     FIRST_PROGRAM,
@@ -41,8 +43,6 @@ PICTURE_PER_PIXEL = 2
 """Bytes on disk of each picture of a sheet."""
 LONG = 10_000
 """Number of iterations beyond which CPUs take hours."""
-QUICK_SIDE = 640
-"""Longer side of photographs, in pixels, up to which the preset quick takes minutes on two cores."""
 SMALL_SIDE = 100
 """Longer side of photographs, in pixels, below which a downscale is likely to be a mistake."""
 OPTIONS = {
@@ -86,7 +86,8 @@ class RunForecast:
         phase, needed = self.peak
         if needed.total <= limit:
             return
-        largest = max(needed._asdict().items(), key=lambda item: item[1])[0]
+        parts = needed._asdict()
+        largest = max(parts, key=parts.__getitem__)
         if largest == "program":  # No option makes it smaller.
             advice = f"the program itself takes about {in_bytes(needed.program)} of it:"
         else:
@@ -108,8 +109,8 @@ class RunForecast:
     def check_disk(self, out: Path) -> None:
         """Raise ValueError unless the disk of a folder, which need not exist, has room for the run."""
         path = Path(os.path.abspath(out))
-        # The nearest existing folder decides the disk.
-        free = shutil.disk_usage(next(folder for folder in (path, *path.parents) if folder.is_dir())).free
+        existing = next(folder for folder in (path, *path.parents) if folder.is_dir())
+        free = shutil.disk_usage(existing).free
         if self.disk_bytes > free:
             raise ValueError(
                 f"{out} needs about {in_bytes(self.disk_bytes)} for models and checkpoints, but the disk has "
@@ -130,7 +131,8 @@ def forecast_run(scene: Scene, plan: RunPlan, num_given: int | None = None, num_
     is_host = default_platform() == "cpu"
     stages = _forecasts(scene, plan, num_given, num_devices)
     # Compiled programs stay in memory, so each stage adds to the ones before.
-    resident, phases = PROCESS + FIRST_PROGRAM - FURTHER_STAGE, {}
+    resident = PROCESS + FIRST_PROGRAM - FURTHER_STAGE
+    phases = {}
     for name, stage in stages.items():
         if stage.is_trained:
             resident += FURTHER_STAGE + FURTHER_PROGRAM * (stage.num_programs - 1)
@@ -145,13 +147,14 @@ def forecast_run(scene: Scene, plan: RunPlan, num_given: int | None = None, num_
         model=sum(model_bytes),
         pixels=EVALUATION_PER_PIXEL * largest_view((*scene.test, *scene.train)),
     )
-    limits = [] if num_given is None else ["init"]
-    limits += [name for planned in plan.stages for name in planned.system.limits()]
     # Models stay, the states that can be continued, checkpoints of one stage at a time, and sheets of photograph,
     # renders and error. The last stage's state is one of its checkpoints.
     kept = sum(stages[name].model_bytes for name in plan.kept_states[:-1])
-    pixels = sum(view.camera.width * view.camera.height for view in scene.test or scene.train)
-    pictures = PICTURE_PER_PIXEL * (3 + max(1, len(plan.chains) - 1)) * pixels
+    pictures_per_sheet = 3 + max(1, len(plan.chains) - 1)
+    pictures = PICTURE_PER_PIXEL * pictures_per_sheet * _num_pixels(scene.test or scene.train)
+    limits = [] if num_given is None else ["init"]
+    for planned in plan.stages:
+        limits += planned.system.limits()
     return RunForecast(
         phases,
         disk_bytes=sum(model_bytes) + STATES * (kept + KEPT_STATES * max(model_bytes)) + pictures,
@@ -169,19 +172,25 @@ def _forecasts(scene: Scene, plan: RunPlan, num_given: int | None, num_devices: 
     return stages
 
 
+def _num_pixels(views: Sequence[View]) -> int:
+    return sum(view.camera.width * view.camera.height for view in views)
+
+
 def time_after(
     scene: Scene, plan: RunPlan, names: Sequence[str], num_given: int | None = None, num_tuning: int = 0
 ) -> dict[str, RestOfRun]:
     """Return what follows each of the stages that are to be trained: others, the run's evaluation, and `num_tuning`
     iterations that tune a file. `num_given` as in `forecast_run`."""
-    stages, found = _forecasts(scene, plan, num_given, 1), dict[str, RestOfRun]()
+    stages = _forecasts(scene, plan, num_given, 1)
     drawn = DRAWN_SHARE * len(plan.names) * (len(scene.train) + len(scene.test))
+    rests = {}
     for index, name in enumerate(names):
-        seconds = stages[name].seconds / plan[name].stage.iterations
+        seconds_per_iteration = stages[name].seconds / plan[name].stage.iterations
         later = [stages[other] for other in names[index + 1 :]]
-        iterations = sum(other.seconds for other in later) / seconds + drawn + num_tuning
-        found[name] = RestOfRun(iterations, sum(other.num_programs for other in later) + len(plan.names))
-    return found
+        iterations = sum(stage.seconds for stage in later) / seconds_per_iteration
+        num_programs = sum(stage.num_programs for stage in later) + len(plan.names)
+        rests[name] = RestOfRun(iterations + drawn + num_tuning, num_programs)
+    return rests
 
 
 def print_forecast(
@@ -191,59 +200,66 @@ def print_forecast(
     """Print the forecast of a run, for at most `max_memory` bytes (None: what is available). `out` is the
     folder of a new run, whose disk must have room for it; None for a resumed run. Raises ValueError if the run cannot
     fit, naming the options to change. Other arguments as in `forecast_run`."""
-    found, limit = forecast_run(scene, record.plan, num_given, num_devices), allowed_memory(max_memory, num_devices)
-    found.check_memory(limit)
+    forecast = forecast_run(scene, record.plan, num_given, num_devices)
+    limit = allowed_memory(max_memory, num_devices)
+    forecast.check_memory(limit)
     if num_devices > 1:
-        found.check_one_device(allowed_memory(max_memory))
+        forecast.check_one_device(allowed_memory(max_memory))
     if out is not None:
-        found.check_disk(out)
-    print(found.text(limit), flush=True)
-    side = max(max(view.camera.width, view.camera.height) for view in scene.train)
-    is_long = sum(stage.iterations for stage in record.options.all_stages()) > LONG
-    is_long |= record.preset == "quick" and side > QUICK_SIDE
+        forecast.check_disk(out)
+    print(forecast.text(limit), flush=True)
+    side = _longest_side(scene)
+    num_iterations = sum(stage.iterations for stage in record.options.all_stages())
+    is_long = num_iterations > LONG or (record.preset == "quick" and side > QUICK_SIDE)
     has_quick = default_platform() == "cpu" and "quick" in type(record.options).presets()
     if out is not None and is_long and has_quick:
         print(f"quicker on CPUs: {quick_flags(side, record.scene.downscale)} takes minutes", flush=True)
 
 
+def _longest_side(scene: Scene) -> int:
+    return max(max(view.camera.width, view.camera.height) for view in scene.train)
+
+
 def doubts_about(scene: Scene, record: RunRecord) -> list[str]:
     """Return why a run would show little or take long, with better values: a small or huge memory budget, or a
     downscale that leaves few pixels."""
-    found, downscale = [], record.scene.downscale
-    # Built-in scenes are drawn as small as tests need it.
-    is_captured = not record.scene.is_built_in
-    pixels, budget = sum(view.camera.width * view.camera.height for view in scene.train), record.options.budget_bytes
-    one = record.options.initial_bytes
+    doubts = []
+    options = record.options
+    budget = options.budget_bytes
+    one = options.initial_bytes
     # A file budget without a memory budget sets that as well.
     of_file = record.unbudgeted() != record
-    name, share = ("file_budget", MEMORY_OF_FILE) if of_file else ("memory_budget", 1.0)
-    if record.options.small_budget and not of_file:
-        found.append(f"{record.options.small_budget}; it is in bytes of the model in memory")
-    elif record.options.small_budget and budget is not None:
-        enough = in_bytes(SENSIBLE_GAUSSIANS * one / share).replace(" ", "")
-        found.append(
-            f"`file_budget` has room for about {budget // one:.0f} Gaussians, and scenes need thousands: {enough} "
-            f"holds about {SENSIBLE_GAUSSIANS:,}"
+    name = "file_budget" if of_file else "memory_budget"
+    share = MEMORY_OF_FILE if of_file else 1.0
+
+    def size_for(num_gaussians: float) -> str:
+        return in_bytes(num_gaussians * one / share).replace(" ", "")
+
+    if options.small_budget and not of_file:
+        doubts.append(f"{options.small_budget}; it is in bytes of the model in memory")
+    elif options.small_budget and budget is not None:
+        doubts.append(
+            f"`file_budget` has room for about {budget // one:.0f} Gaussians, and scenes need thousands: "
+            f"{size_for(SENSIBLE_GAUSSIANS)} holds about {SENSIBLE_GAUSSIANS:,}"
         )
-    if is_captured and budget is not None and budget > pixels * one:
-        found.append(
+    if record.scene.is_built_in:
+        return doubts  # Built-in scenes are drawn as small as tests need it.
+    pixels = _num_pixels(scene.train)
+    if budget is not None and budget > pixels * one:
+        doubts.append(
             f"`{name}` has room for more Gaussians ({budget / one:,.0f}) than the photographs have pixels "
-            f"({pixels:,}): {in_bytes(0.1 * pixels * one / share).replace(' ', '')} holds one for ten pixels"
+            f"({pixels:,}): {size_for(0.1 * pixels)} holds one for ten pixels"
         )
-    size = max(((view.camera.width, view.camera.height) for view in scene.train), key=max)
-    if is_captured and downscale > 1 and max(size) < SMALL_SIDE:
-        sensible = math.ceil(max(size) * downscale / QUICK_SIDE)
-        advice = f"`downscale` {sensible} makes the longer side {max(size) * downscale // sensible:,}"
-        found.append(
-            f"`downscale` {downscale} leaves photographs of {size[0]}×{size[1]} pixels, which show little: {advice}"
+    downscale = record.scene.downscale
+    side = _longest_side(scene)
+    if downscale > 1 and side < SMALL_SIDE:
+        largest = next(view.camera for view in scene.train if max(view.camera.width, view.camera.height) == side)
+        sensible = math.ceil(side * downscale / QUICK_SIDE)
+        doubts.append(
+            f"`downscale` {downscale} leaves photographs of {largest.width}×{largest.height} pixels, which show "
+            f"little: `downscale` {sensible} makes the longer side {side * downscale // sensible:,}"
         )
-    return found
-
-
-def quick_flags(longest_side: int, downscale: int = 1) -> str:
-    """Return the flags of a quick training with photographs of this longer side, already downscaled by a factor."""
-    downscale *= max(1, math.ceil(longest_side / QUICK_SIDE))
-    return "--preset quick" + (f" --downscale {downscale}" if downscale > 1 else "")
+    return doubts
 
 
 def room_for_photographs(max_memory: int | None) -> int | None:

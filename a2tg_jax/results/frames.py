@@ -24,9 +24,10 @@ from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.io.path_file import load_views
 from a2tg_jax.model import Model
 from a2tg_jax.renderer import Renderer
-from a2tg_jax.results.folder import RunFolder, check_new
+from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.images import picture_names, save_animation, to_uint8, write_png
 from a2tg_jax.results.model_source import open_source
+from a2tg_jax.results.output_paths import check_new
 
 Route = Literal["test", "smooth", "orbit"]
 FLIGHT_SIZE = (1280, 720)
@@ -126,7 +127,7 @@ def render_frames(
     if out.exists() and not out.is_dir():
         raise FileExistsError(f"{out} is a file; choose a folder for the frames with `out`")
     source = open_source(run.path, name, edit)
-    cameras = dict(_cameras(source.model, route, num_frames))
+    cameras = _cameras(source.model, route, num_frames)
     if size is None and route != "test":
         first = next(iter(cameras.values()))
         size = FLIGHT_SIZE if first.width >= first.height else FLIGHT_SIZE[::-1]
@@ -158,22 +159,16 @@ def video_name() -> str:
 def write_video(frames: Sequence[Path], *, frames_per_second: float = FRAMES_PER_SECOND) -> Path:
     """Make a video of frame_0000.png … in their folder: an MP4 with ffmpeg, otherwise a looping animated WebP.
     Raises ValueError if ffmpeg fails."""
-    path, program = frames[0].with_name(video_name()), shutil.which("ffmpeg")
-
-    def opened() -> Iterator[Image.Image]:
-        for frame in frames:
-            with Image.open(frame) as image:
-                # Read now: the file is closed when the generator resumes.
-                image.load()
-                yield image
-
+    path = frames[0].with_name(video_name())
+    program = shutil.which("ffmpeg")
     with FrameFolder(path.parent).writing(path.name) as temporary:
         if program is None:
-            save_animation(temporary, opened(), frames_per_second, quality=WEBP_QUALITY)
+            save_animation(temporary, _images(frames), frames_per_second, quality=WEBP_QUALITY)
             return path
         # Most players decode yuv420p only, which needs even sides: the last row or column is repeated.
         with Image.open(frames[0]) as first:
-            right, bottom = first.width % 2, first.height % 2
+            right = first.width % 2
+            bottom = first.height % 2
         even_sides = f"format=gbrp,pad=iw+{right}:ih+{bottom},fillborders=right={right}:bottom={bottom}:mode=smear"
         source = ["-framerate", str(frames_per_second), "-i", FRAME_NAME]
         # Otherwise ffmpeg continues with whatever numbered files follow.
@@ -187,28 +182,37 @@ def write_video(frames: Sequence[Path], *, frames_per_second: float = FRAMES_PER
     return path
 
 
-def _cameras(model: Model, route: Route | Path, num_frames: int) -> Iterator[tuple[str, Camera]]:
-    """Return file names and cameras of the frames; frames of a path have the names that `write_video` expects."""
+def _images(frames: Sequence[Path]) -> Iterator[Image.Image]:
+    for frame in frames:
+        with Image.open(frame) as image:
+            # Read now: the file is closed when the generator resumes.
+            image.load()
+            yield image
 
-    def numbered(path: Sequence[Camera]) -> Iterator[tuple[str, Camera]]:
-        return ((FRAME_NAME % index, camera) for index, camera in enumerate(path))
 
+def _cameras(model: Model, route: Route | Path, num_frames: int) -> dict[str, Camera]:
+    """Return cameras by the file names of their frames; frames of a path have the names that `write_video` expects."""
     if isinstance(route, Path):
         try:
             saved = load_views(route)
         except FileNotFoundError as error:
             raise FileNotFoundError(f"{error}{did_you_mean(str(route), get_args(Route))}") from None
-        return numbered(path_through(saved, num_frames))
-    if model.origin is None:
+        return _numbered(path_through(saved, num_frames))
+    origin = model.origin
+    if origin is None:
         raise ValueError("the model has no cameras to render")
-    views = sorted(zip(model.origin.names, model.origin.is_test, model.origin.cameras, strict=True), key=lambda v: v[0])
-    if route != "test":
-        cameras = [camera for _, _, camera in views]
-        if route == "smooth":
-            return numbered(smooth_path(without_outlying(cameras), num_frames))
-        return numbered(turntable(cameras, num_frames, model.origin.up))
-    if not model.origin.is_test.any():
+    by_name = sorted(range(len(origin.names)), key=origin.names.__getitem__)
+    cameras = list(origin.cameras)
+    if route == "smooth":
+        return _numbered(smooth_path(without_outlying([cameras[index] for index in by_name]), num_frames))
+    if route == "orbit":
+        return _numbered(turntable([cameras[index] for index in by_name], num_frames, origin.up))
+    tests = {origin.names[index]: cameras[index] for index in by_name if origin.is_test[index]}
+    if not tests:
         raise ValueError("the run has no test views; render a path instead with `path` smooth")
-    tests = {name: camera for name, is_test, camera in views if is_test}
     names = picture_names(tests)
-    return ((names[name], camera) for name, camera in tests.items())
+    return {names[name]: camera for name, camera in tests.items()}
+
+
+def _numbered(path: Sequence[Camera]) -> dict[str, Camera]:
+    return {FRAME_NAME % index: camera for index, camera in enumerate(path)}

@@ -26,10 +26,11 @@ MOST_BYTES = 1 << 26
 
 
 def write_history(path: Path, history: History) -> None:
-    columns = history.to_dict()
-    rows = zip(*(np.asarray(column).tolist() for column in columns.values()), strict=True)
+    columns = {name: np.asarray(column).tolist() for name, column in history.to_dict().items()}
     with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows([columns, *rows])
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        writer.writerows(zip(*columns.values(), strict=True))
 
 
 def read_history(path: Path) -> History:
@@ -39,27 +40,35 @@ def read_history(path: Path) -> History:
         raise FileNotFoundError(f"{path} is missing: put it back, or train the stage again")
     with io.TextIOWrapper(open_regular(path, MOST_BYTES), encoding="utf-8", newline="") as file:
         try:
-            first = file.readline().rstrip("\r\n").split(",")
-            terms = first[len(NAMES) :]
-            if tuple(first[: len(NAMES)]) != NAMES or not all(name.startswith(TERM) for name in terms):
-                raise ValueError(f"has the columns {shortened(', '.join(first))}; {', '.join(NAMES)} are expected")
-            if len({*terms}) < len(terms):
-                raise ValueError(f"has a column twice: {shortened(', '.join(terms))}")
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # A history may be empty.
-                # comments=None: "#" in a damaged file is an error, not a comment.
-                values = np.loadtxt(file, delimiter=",", comments=None, ndmin=2)
-            if values.size and values.shape[1] != len(first):
-                raise ValueError(f"has rows of {values.shape[1]} numbers; {len(first)} are expected")
-            values = values.reshape(-1, len(first))
-            # PSNR of equal images is infinite.
-            is_large = np.abs(values[:, [name != "psnr" for name in first]]) > LARGEST
-            if np.isnan(values[:, : len(NAMES)]).any() or is_large.any():
-                raise ValueError("has numbers that are not finite")
+            names = file.readline().rstrip("\r\n").split(",")
+            columns = _read_columns(file, names)
         except ValueError as error:
             raise ValueError(f"{path}: {shortened(str(error), 200)}; train the stage again") from error
-    columns = {name: values[:, place] for place, name in enumerate(first)}
-    return History.of_columns(columns | {name: columns[name].astype(np.int64) for name in INTEGERS})
+    for name in INTEGERS:
+        columns[name] = columns[name].astype(np.int64)
+    return History.of_columns(columns)
+
+
+def _read_columns(file: io.TextIOBase, names: list[str]) -> dict[str, np.ndarray]:
+    """Return the columns below the first line. Raises ValueError with a reason."""
+    terms = names[len(NAMES) :]
+    if tuple(names[: len(NAMES)]) != NAMES or not all(name.startswith(TERM) for name in terms):
+        raise ValueError(f"has the columns {shortened(', '.join(names))}; {', '.join(NAMES)} are expected")
+    if len(set(terms)) < len(terms):
+        raise ValueError(f"has a column twice: {shortened(', '.join(terms))}")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # A history may be empty.
+        # comments=None: "#" in a damaged file is an error, not a comment.
+        values = np.loadtxt(file, delimiter=",", comments=None, ndmin=2)
+    if values.size and values.shape[1] != len(names):
+        raise ValueError(f"has rows of {values.shape[1]} numbers; {len(names)} are expected")
+    columns = dict(zip(names, values.reshape(-1, len(names)).T, strict=True))
+    for name, column in columns.items():
+        # PSNR of equal images is infinite.
+        is_large = name != "psnr" and (np.abs(column) > LARGEST).any()
+        if is_large or (name in NAMES and np.isnan(column).any()):
+            raise ValueError("has numbers that are not finite")
+    return columns
 
 
 def tensorboard_library() -> Any:
@@ -71,36 +80,40 @@ class EventWriter:
     """Writer of a stage's history for TensorBoard. Each call adds the rows since the last one."""
 
     def __init__(self, run: RunFolder, name: str):
-        self._run, self._name = run, name
+        self._run = run
+        self._name = name
         self._file: Any = None
-        self._written = 0
+        self._num_written = 0
 
     def skip(self, history: History) -> None:
         """Mark the rows of a history as written by an earlier process."""
-        self._written = len(history.iteration)
+        self._num_written = len(history.iteration)
 
     def add(self, history: History) -> None:
         """Write the new rows, as LOSS/NAME and so on, by iteration of the stage."""
-        rows = range(self._written, len(history.iteration))
+        rows = range(self._num_written, len(history.iteration))
         if not rows:
             return
         if self._file is None:
-            folder = self._run.tensorboard
-            # tensorboardX chooses the name: what is new afterwards is this writer's.
-            before = set(folder.glob("events.*"))
-            # The suffix keeps files of several stages and processes apart.
-            suffix = f".{len(before)}.{self._name}"
-            self._file = tensorboard_library().SummaryWriter(str(folder), filename_suffix=suffix)
-            self._run.own_all([f"{folder.name}/{path.name}" for path in sorted(set(folder.glob("events.*")) - before)])
-        columns = history.to_dict()
-        for row in rows:
-            for name in columns.keys() - {"stage", "iteration"}:
-                # A loss term that a stage lacks is NaN.
-                if not np.isnan(columns[name][row]):
-                    value, iteration = float(columns[name][row]), int(history.iteration[row])
-                    self._file.add_scalar(f"{name}/{self._name}", value, iteration)
+            self._file = self._new_file()
+        for name, column in history.to_dict().items():
+            if name not in ("stage", "iteration"):
+                for row in rows:
+                    # A loss term that a stage lacks is NaN.
+                    if not np.isnan(column[row]):
+                        self._file.add_scalar(f"{name}/{self._name}", float(column[row]), int(history.iteration[row]))
         self._file.flush()
-        self._written = rows.stop
+        self._num_written = rows.stop
+
+    def _new_file(self) -> Any:
+        folder = self._run.tensorboard
+        # tensorboardX chooses the name: what is new afterwards is this writer's.
+        before = set(folder.glob("events.*"))
+        # The suffix keeps files of several stages and processes apart.
+        file = tensorboard_library().SummaryWriter(str(folder), filename_suffix=f".{len(before)}.{self._name}")
+        new = sorted(set(folder.glob("events.*")) - before)
+        self._run.own_all([path.relative_to(self._run.path).as_posix() for path in new])
+        return file
 
     def close(self) -> None:
         if self._file is not None:

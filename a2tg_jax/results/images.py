@@ -6,7 +6,6 @@ Images are uint8 [H, W, 3] unless said otherwise.
 import base64
 import hashlib
 import io
-import itertools
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -26,7 +25,8 @@ from a2tg_jax.host.text import PROGRAM
 ERROR_GAIN = 4
 CHECKER = (0.75, 0.55)
 """Greys of `checkered`."""
-MARGIN, CAPTION_HEIGHT = 6, 22
+MARGIN = 6
+CAPTION_HEIGHT = 22
 FONT = Path(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf")
 """Font of captions; Pillow's default lacks × and ²."""
 LONGEST_STEM = 190
@@ -71,7 +71,8 @@ def largest_gain(target: np.ndarray, before: np.ndarray, after: np.ndarray) -> t
         means: np.ndarray = uniform_filter(error, size=side, mode="constant", origin=-(side // 2))
         return means[: max(1, height - side + 1), : max(1, width - side + 1)]
 
-    gain, is_good = in_squares(errors[0] - errors[1]), in_squares(errors[1]) <= errors[1].mean()
+    gain = in_squares(errors[0] - errors[1])
+    is_good = in_squares(errors[1]) <= errors[1].mean()
     best = np.where(is_good, gain, -np.inf) if is_good.any() else gain
     top, left = map(int, np.unravel_index(int(best.argmax()), best.shape))
     return slice(top, top + side), slice(left, left + side)
@@ -107,11 +108,14 @@ def picture_names(view_names: Iterable[str]) -> dict[str, str]:
         if len(data) > LONGEST_STEM:
             # ignore drops a character that the cut divided.
             stem = f"{data[:LONGEST_STEM].decode(errors='ignore')}-{hashlib.sha256(data).hexdigest()[:8]}"
-        choices = itertools.chain([stem], (f"{stem}-{number}" for number in itertools.count(2)))
+        unique = stem
+        number = 1
         # casefold: macOS and Windows do not distinguish case.
-        chosen = next(choice for choice in choices if choice.casefold() not in taken)
-        taken.add(chosen.casefold())
-        names[view_name] = f"{chosen}.png"
+        while unique.casefold() in taken:
+            number += 1
+            unique = f"{stem}-{number}"
+        taken.add(unique.casefold())
+        names[view_name] = f"{unique}.png"
     return names
 
 

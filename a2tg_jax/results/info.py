@@ -13,8 +13,9 @@ from a2tg_jax.host.text import in_bytes
 from a2tg_jax.io.formats import file_bytes, format_of, load_splats
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.model import Model
-from a2tg_jax.results.folder import RunFolder, iteration_of, old_run, resuming_command
-from a2tg_jax.results.record import is_finished, read_record, repeating_command
+from a2tg_jax.results.commands import repeating_command, resuming_command
+from a2tg_jax.results.folder import RunFolder, iteration_of, old_run
+from a2tg_jax.results.record import is_finished, read_record
 
 SPLITS = ("test", "validation", "train")
 
@@ -22,24 +23,27 @@ SPLITS = ("test", "validation", "train")
 def describe_run(run: RunFolder) -> str:
     """Return scene, systems, and each stage's progress, model and metrics as text. Damaged metrics and models are
     named. Raises ValueError if run.toml is damaged."""
-    facts, old = run_facts(run), old_run(run)
-    stages, damage = facts["stages"], facts["damage"]
+    facts = run_facts(run)
     compared = f", compared with {', '.join(facts['compare'])}" if facts["compare"] else ""
-    width = max(len(stage["name"]) for stage in stages)
     lines = [
         f"scene    {facts['scene']} (downscale {facts['downscale']})",
         f"system   {facts['system']}{compared}",
         f"repeat   {repeating_command(run)}",
-        *(f"model    {stage['name']:<{width}}  {_stage_text(stage)}" for stage in stages),
-        f"report   {facts['report'] or 'none yet: a2tg eval writes it'}",
-        *([f"page     {facts['page']}, {in_bytes(run.viewer.stat().st_size)}"] if facts["page"] else []),
-        f"disk     {in_bytes(facts['disk_bytes'])}",
-        *([f"damaged  {damage}: {shlex.join(['a2tg', 'eval', str(run.path)])} rewrites it"] if damage else []),
     ]
+    width = max(len(stage["name"]) for stage in facts["stages"])
+    for stage in facts["stages"]:
+        lines.append(f"model    {stage['name']:<{width}}  {_stage_text(stage)}")
+    lines.append(f"report   {facts['report'] or 'none yet: a2tg eval writes it'}")
+    if facts["page"]:
+        lines.append(f"page     {facts['page']}, {in_bytes(run.viewer.stat().st_size)}")
+    lines.append(f"disk     {in_bytes(facts['disk_bytes'])}")
+    if facts["damage"]:
+        lines.append(f"damaged  {facts['damage']}: {shlex.join(['a2tg', 'eval', str(run.path)])} rewrites it")
     if not facts["is_finished"]:
         lines.append(f"training is not finished; continue with: {resuming_command(run)}")
     if is_regular(run.finish):
         lines.append(f"finished {run.finish} has its source and options")
+    old = old_run(run)
     if old is not None:
         lines.append(f"replaces a run that is kept in {old.path} until this one has its report")
     return "\n".join(lines)
@@ -88,12 +92,15 @@ def describe_runs(runs: Sequence[RunFolder]) -> str:
 
 def run_facts(run: RunFolder) -> dict[str, Any]:
     """Return the content of a run folder as JSON values. Raises ValueError if run.toml is damaged."""
-    record, measured, damage = read_record(run), dict[str, dict[str, float]](), None
+    record = read_record(run)
+    psnrs: dict[str, dict[str, float]] = {}
+    damage = None
     try:
-        measured = read_psnrs(run.metrics) if is_regular(run.metrics) else {}
+        if is_regular(run.metrics):
+            psnrs = read_psnrs(run.metrics)
     except ValueError as error:
         damage = str(error)
-    names = record.plan.names
+    stages = [{"name": name, **_stage_facts(run, name), "psnr": psnrs.get(name)} for name in record.plan.names]
     return {
         "path": str(run.path),
         "scene": record.scene.path,
@@ -101,7 +108,7 @@ def run_facts(run: RunFolder) -> dict[str, Any]:
         "system": record.system,
         "compare": list(record.compare),
         "is_finished": is_finished(run, record),
-        "stages": [{"name": name, **_stage_facts(run, name), "psnr": measured.get(name)} for name in names],
+        "stages": stages,
         "report": str(run.report) if run.report.is_file() else None,
         "page": str(run.viewer) if run.viewer.is_file() else None,
         "disk_bytes": sum(map(_size_of, run.path.rglob("*"))),
@@ -126,9 +133,10 @@ def _size_of(path: Path) -> int:
 
 def read_psnrs(path: Path) -> dict[str, dict[str, float]]:
     """Return the PSNR in a metrics.json: model → test or validation, train → dB. Raises ValueError if it is damaged."""
-    data, psnrs = read_json(path), dict[str, dict[str, float]]()
+    psnrs: dict[str, dict[str, float]] = {}
+    metrics = read_json(path)
     try:
-        for name, model in data["models"].items():
+        for name, model in metrics["models"].items():
             psnrs[name] = {split: model[split]["psnr"] for split in SPLITS if split in model}
             # Not isinstance: true would be printed as 1.00 dB.
             if not all(type(psnr) in (int, float) for psnr in psnrs[name].values()):
@@ -183,9 +191,9 @@ def _stage_text(stage: Mapping[str, Any]) -> str:
 def _counts_text(facts: Mapping[str, Any]) -> str:
     """Return the numbers of `model_facts` as text."""
     parts = [f"{facts['num_gaussians']:,} Gaussians", in_bytes(facts["num_bytes"])]
-    textures = f"textures over ±{facts['extent']:g}σ" if "extent" in facts else "textures"
-    counts = {"degrees": dict(enumerate(facts.get("degrees", ()))), textures: facts.get("textures", {})}
-    for noun, found in counts.items():
-        if found:
-            parts.append(f"{noun} " + ", ".join(f"{kind}: {num:,}" for kind, num in found.items()))
+    if facts.get("degrees"):
+        parts.append("degrees " + ", ".join(f"{degree}: {num:,}" for degree, num in enumerate(facts["degrees"])))
+    if facts.get("textures"):
+        sizes = ", ".join(f"{size}: {num:,}" for size, num in facts["textures"].items())
+        parts.append(f"textures over ±{facts['extent']:g}σ {sizes}")
     return "; ".join(parts)

@@ -63,7 +63,8 @@ class MeshOptions:
         check_lengths(self.resolution, self.voxel, self.radius)
         if self.clusters < 1:
             raise ValueError(f"clusters must be at least 1; got {self.clusters}")
-        wanted, most = budget_in_bytes(self.max_memory, "max_memory"), memory_limit()
+        wanted = budget_in_bytes(self.max_memory, "max_memory")
+        most = memory_limit()
         if wanted is not None and wanted > most:
             raise ValueError(f"max_memory must be at most {in_bytes(most)}, the free memory; got {self.max_memory}")
         if self.texture != "none":
@@ -89,7 +90,8 @@ def write_mesh(source: Source, out: Path, options: MeshOptions) -> str:
         raise ValueError(f"{source.title} has no cameras to fuse depths from; give a run folder, or a model of a run")
     # Photographs are checked here, before minutes of fusion; they are read later.
     pictures = _photographs(source, origin) if options.texture == "photographs" else _renders(source, origin)
-    scale, max_bytes = origin.transform.scale, budget_in_bytes(options.max_memory, "max_memory")
+    scale = origin.transform.scale
+    max_bytes = budget_in_bytes(options.max_memory, "max_memory")
     result = extract_mesh(
         source.model,
         resolution=options.resolution,

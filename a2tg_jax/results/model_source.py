@@ -15,6 +15,7 @@ from a2tg_jax.data.load import is_scene
 from a2tg_jax.data.other_runs import model_hint
 from a2tg_jax.data.scene import Scene, origin_of_scene
 from a2tg_jax.host.regular_files import is_regular
+from a2tg_jax.host.text import first_names
 from a2tg_jax.io.edit_file import apply_edit, load_edit
 from a2tg_jax.io.formats import FORMATS, format_of, load_splats, splats_at
 from a2tg_jax.io.model_file import load_model, save_model
@@ -22,17 +23,17 @@ from a2tg_jax.io.other_programs import plain_gaussians
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderSettings
-from a2tg_jax.results.folder import RunFolder, open_run, resuming_command, runs_in
+from a2tg_jax.results.commands import first_training_command, resuming_command
+from a2tg_jax.results.folder import RunFolder, open_run, runs_in
 from a2tg_jax.results.history import write_history
-from a2tg_jax.results.record import PlannedStage, RunRecord, read_record
+from a2tg_jax.results.plan import PlannedStage
+from a2tg_jax.results.record import RunRecord, read_record
 from a2tg_jax.training import History, System
 from a2tg_jax.training.stage import BACKGROUNDS
 from a2tg_jax.training.start import left_out, new_appearance, with_degree
 
 READABLE = [suffix for suffix, format in FORMATS.items() if format.load is not None]
 SHOWN = f"a run folder, or a file *{', *'.join(READABLE)}"
-MOST_LISTED = 5
-"""Largest number of run folders in a message."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,30 +93,44 @@ def open_source(path: Path, name: str | None = None, edit: Path | None = None) -
     prints it; None: the last one of its main system. `edit` is the file of an edit that is applied to the model. Raises
     FileNotFoundError if there is no such file, or the run's stage is not finished, and ValueError if it cannot be
     read."""
-    if edit is not None:
-        change = load_edit(edit)  # Before a large model is read.
-        source = open_source(path, name)
-        return dataclasses.replace(source, model=apply_edit(source.model, change))
+    change = None if edit is None else load_edit(edit)  # Before a large model is read.
     path = splats_at(path)
     if path.is_dir():
-        run = _run_at(path)
-        record, planned = finished_stage(run, name)
-
-        def load_scene() -> Scene | None:
-            try:
-                return record.scene.load()
-            except FileNotFoundError:  # A run is worth showing without its photographs.
-                return None
-
-        title, file = f"{record.scene.name} · {planned.name}", run.model(planned.name)
-        settings = settings_of(planned.system)
-        return Source(load_model(file), title, "", settings, load_scene, file, planned.system)
-    if not is_regular(path):
+        source = _source_of_run(_run_at(path), name)
+    elif not is_regular(path):
         raise FileNotFoundError(f"{path}: no such file or folder")
-    if name is not None:
+    elif name is not None:
         raise ValueError(f"`model` needs a run folder; {path} is not a folder")
-    if not path.name.lower().endswith(tuple(FORMATS)):
+    elif not path.name.lower().endswith(tuple(FORMATS)):
         raise ValueError(f"{path}: is not a scene to show; give {SHOWN}")
+    else:
+        source = _source_of_file(path)
+    if change is None:
+        return source
+    return dataclasses.replace(source, model=apply_edit(source.model, change))
+
+
+def _source_of_run(run: RunFolder, name: str | None) -> Source:
+    record, planned = finished_stage(run, name)
+
+    def load_scene() -> Scene | None:
+        try:
+            return record.scene.load()
+        except FileNotFoundError:  # A run is worth showing without its photographs.
+            return None
+
+    path = run.model(planned.name)
+    return Source(
+        model=load_model(path),
+        title=f"{record.scene.name} · {planned.name}",
+        settings=settings_of(planned.system),
+        load_scene=load_scene,
+        path=path,
+        system=planned.system,
+    )
+
+
+def _source_of_file(path: Path) -> Source:
     # Warnings of the reader are shown in the viewer as well.
     with warnings.catch_warnings(record=True) as caught:
         # A warning that was shown once in this process would not be recorded.
@@ -123,7 +138,7 @@ def open_source(path: Path, name: str | None = None, edit: Path | None = None) -
         model = load_splats(path)
     notes = [str(warning.message).removeprefix(f"{path}: ") for warning in caught]
     for note in notes:
-        warnings.warn(f"{path}: {note}", stacklevel=2)
+        warnings.warn(f"{path}: {note}", stacklevel=3)
     return Source(model, path.stem, ". ".join(notes), path=path)
 
 
@@ -138,14 +153,13 @@ def _run_at(folder: Path) -> RunFolder:
         return open_run(folder)
     # A scene folder is a likely mistake.
     if is_scene(folder):
-        command = ["a2tg", "train", str(folder), "--out", f"runs/{folder.resolve().name}", "--preset", "quick"]
-        raise FileNotFoundError(f"{folder} is a scene that must be trained first: {shlex.join(command)}")
+        raise FileNotFoundError(f"{folder} is a scene that must be trained first: {first_training_command(folder)}")
     runs = runs_in(folder)
-    if not runs:
-        hint = model_hint(folder) or f"; give {SHOWN}"
-        raise FileNotFoundError(f"{folder} is not a run folder (it has no run.toml){hint}")
-    listed = [shlex.quote(str(run.path)) for run in runs[:MOST_LISTED]] + ["…"] * (len(runs) > MOST_LISTED)
-    raise FileNotFoundError(f"{folder} holds run folders; give one of them: {', '.join(listed)}")
+    if runs:
+        names = first_names([shlex.quote(str(run.path)) for run in runs])
+        raise FileNotFoundError(f"{folder} holds run folders; give one of them: {names}")
+    hint = model_hint(folder) or f"; give {SHOWN}"
+    raise FileNotFoundError(f"{folder} is not a run folder (it has no run.toml){hint}")
 
 
 # Splats of a file instead of the first stage of a run
@@ -163,13 +177,13 @@ def check_init(file: Path, out: Path, system: System) -> Model:
     format_of(file)
     if RunFolder(out).is_begun:
         raise ValueError(f"init begins a new run, and {out} holds one: choose another `out`")
-    splats, degree = load_splats(file), system.initial_sh_degree
+    splats = load_splats(file)
     try:
         system.check_given_number(splats.num)
     except ValueError as error:
         raise ValueError(f"init: {file}: {error}") from error
     # The first stage begins with its own appearance.
-    lost = left_out(splats, degree, system.stages()[0].appearance)
+    lost = left_out(splats, system.initial_sh_degree, system.stages()[0].appearance)
     if lost:
         warnings.warn(f"`init` {file} leaves out {' and '.join(lost)}", stacklevel=2)
     return splats
@@ -180,17 +194,21 @@ def write_first_stage(run: RunFolder, record: RunRecord, splats: Model, scene: S
     history."""
     plan = record.plan
     planned = plan[plan.main[0]]
-    splats, appearance, system = splats.live, planned.stage.appearance, planned.system
-    has_shapes = splats.appearance.exponents is not None and appearance.exponents is not None
-    shapes = splats.appearance.shapes if has_shapes else None
+    system = planned.system
+    template = planned.stage.appearance
+    splats = splats.live
+    has_shapes = splats.appearance.exponents is not None and template.exponents is not None
     # File → original world → the scene's normalised one.
-    to_scene = scene.transform if splats.origin is None else splats.origin.transform.inverse().then(scene.transform)
+    to_scene = scene.transform
+    if splats.origin is not None:
+        to_scene = splats.origin.transform.inverse().then(scene.transform)
+    shapes = splats.appearance.shapes if has_shapes else None
     gaussians = transform_gaussians(plain_gaussians(splats, keeps_shapes=shapes is not None), to_scene)
     gaussians = with_degree(gaussians, system.initial_sh_degree)
-    shown = new_appearance(appearance, gaussians, system)
+    appearance = new_appearance(template, gaussians, system)
     if shapes is not None:
-        shown = shown.with_shapes(shapes)
-    model = Model(gaussians, shown, background=BACKGROUNDS[system.background], origin=origin_of_scene(scene))
+        appearance = appearance.with_shapes(shapes)
+    model = Model(gaussians, appearance, background=BACKGROUNDS[system.background], origin=origin_of_scene(scene))
     # No system in the header: none trained it, so that resuming has no options to compare.
     save_model(run.own(run.model(planned.name)), model, {"init": record.init})
     write_history(run.own(run.history(planned.name)), History.empty())

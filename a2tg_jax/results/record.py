@@ -1,6 +1,6 @@
-"""Record of a run (scene, system with all its options, systems to compare), and the plan of its stages.
+"""Record of a run: scene, system with all its options, systems to compare.
 
-The record is kept as run.toml. A configuration file has the same keys; missing ones have the command line's defaults:
+It is kept as run.toml. A configuration file has the same keys; missing ones have the command line's defaults:
 
     scene = "../scenes/fox"              # relative to the file's folder; or s3://bucket/fox, or built in: "cells"
     downscale = 2
@@ -18,31 +18,29 @@ In a file with `version`, as a run's has, missing options are as in the preset "
 """
 
 import dataclasses
-import math
 import os
-import shlex
 import warnings
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import jax
-import numpy as np
 import tomli_w
 from tyro.conf import Fixed, Suppress, UseAppendAction, arg
 
 from a2tg_jax.core.budget import MEGABYTE, budget_in_bytes, megabytes_of
 from a2tg_jax.data.load import SceneSource
 from a2tg_jax.host.atomic import write_whole
-from a2tg_jax.host.json_text import MOST_TOML_BYTES, parse_toml, read_json
+from a2tg_jax.host.json_text import MOST_TOML_BYTES, parse_toml
 from a2tg_jax.host.regular_files import expanded, is_regular, read_regular
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.io.config_json import changed_config, config_from_dict, config_to_dict, flatten_config, merged
 from a2tg_jax.io.model_rows import check_encodable
+from a2tg_jax.results.commands import repeating_command
 from a2tg_jax.results.folder import RunFolder
+from a2tg_jax.results.plan import RunPlan, plan_run
 from a2tg_jax.systems.bytewise import Bytewise
-from a2tg_jax.training import Stage, System, find_system, like
+from a2tg_jax.training import System, find_system, like
 from a2tg_jax.training.options import own_options
 
 DEFAULT_SYSTEM = "bytewise"
@@ -51,10 +49,8 @@ MEMORY_OF_FILE = 7.0
 """Bytes of a model for each byte of a compact file with tuned numbers."""
 OnNan = Literal["stop", "restore"]
 """Action on divergence: end with an error, or restore the newest checkpoint and reorder the views."""
-LONGEST_WITHOUT_CHECKPOINT = 500
-"""Largest number of iterations between checkpoints."""
-STAGE_OPTIONS = ("loss", "rates", "memory_budget", "exposure", "refine_poses", "corrections", "more")
-"""Options of every system that affect training only through its stages."""
+PLAIN = ("gaussians-2d", "gaussians-2d-mcmc")
+"""Systems without textures, which are baselines of the others."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,16 +89,17 @@ class RunRecord:
     def systems(self) -> dict[str, System]:
         """Main system and then the compared ones, by label. Raises ValueError if a system is not found, two have the
         same label, or a compared one's option is invalid."""
-        found = {label_of(self.system): self.options}
+        systems = {label_of(self.system): self.options}
         for name in self.compare:
-            if label_of(name) in found:
-                raise ValueError(f"compare: two systems of the run would be called {shortened(label_of(name))!r}")
-            other, given = compared_system(name, self.options, self.preset), self.compare_options.get(name, {})
-            found[label_of(name)] = changed_config(other, given, f"compare_options.{name}")
-        return found
+            label = label_of(name)
+            if label in systems:
+                raise ValueError(f"compare: two systems of the run would be called {shortened(label)!r}")
+            usual = compared_system(name, self.options, self.preset)
+            systems[label] = changed_config(usual, self.compare_options.get(name, {}), f"compare_options.{name}")
+        return systems
 
     @property
-    def plan(self) -> "RunPlan":
+    def plan(self) -> RunPlan:
         """Plan of the stages to train."""
         return plan_run(self.systems)
 
@@ -134,13 +131,16 @@ class RunRecord:
         """Return the record with the memory budget that goes with its file budget, unless it has another."""
         if self.file_bytes is None or self.options.memory_budget is not None:
             return self
-        budget = round(MEMORY_OF_FILE * self.file_bytes) / MEGABYTE
-        return dataclasses.replace(self, options=dataclasses.replace(self.options, memory_budget=budget))
+        return self.with_options(memory_budget=round(MEMORY_OF_FILE * self.file_bytes) / MEGABYTE)
 
     def unbudgeted(self) -> "RunRecord":
         """Return the record without the memory budget that `budgeted` adds."""
-        plain = dataclasses.replace(self, options=dataclasses.replace(self.options, memory_budget=None))
+        plain = self.with_options(memory_budget=None)
         return plain if plain.budgeted() == self else self
+
+    def with_options(self, **changes: Any) -> "RunRecord":
+        """Return the record with some options changed."""
+        return dataclasses.replace(self, options=dataclasses.replace(self.options, **changes))
 
     def placed(self, folder: Path = Path()) -> "RunRecord":
         """Return the record with full paths; relative ones start from a folder. Warns if a folder has the name of a
@@ -148,8 +148,9 @@ class RunRecord:
         path = self.scene.path
         if self.scene.is_built_in and (folder / path).exists():
             warnings.warn(f"{path} is the built-in scene; give ./{path} for the folder of that name", stacklevel=2)
-        path = path if path == "" or self.scene.is_built_in else scene_place(path, folder)
-        init = None if self.init is None else os.path.realpath(folder / os.path.expanduser(self.init))
+        if path and not self.scene.is_built_in:
+            path = scene_place(path, folder)
+        init = None if self.init is None else scene_place(self.init, folder)
         return dataclasses.replace(self, scene=dataclasses.replace(self.scene, path=path), init=init)
 
     def with_system(self, name: str, preset: str | None) -> "RunRecord":
@@ -158,8 +159,6 @@ class RunRecord:
         return dataclasses.replace(self, system=name, preset=preset, options=options, compare_options={})
 
 
-PLAIN = ("gaussians-2d", "gaussians-2d-mcmc")
-"""Systems without textures, which are baselines of the others."""
 SCENE_KEYS = {"scene": "path"} | {field.name: field.name for field in dataclasses.fields(SceneSource)[1:]}
 """Names of the fields of a scene's source by their keys in run.toml."""
 KEYS = (*SCENE_KEYS, *(field.name for field in dataclasses.fields(RunRecord)[1:]), "version")
@@ -173,22 +172,24 @@ def label_of(name: str) -> str:
 def chosen_system(name: str, preset: str | None = None) -> System:
     """Return a system by name, with the options of a preset. Options set by an instance take precedence.
     Raises ValueError if there is no such system or preset."""
-    found = find_system(name)
+    system = find_system(name)
     if preset is None:
-        return found
-    return changed_config(type(found).preset(preset), own_options(found, type(found)()), name)
+        return system
+    kind = type(system)
+    return changed_config(kind.preset(preset), own_options(system, kind()), name)
 
 
 def compared_system(name: str, other: System, preset: str | None = None) -> System:
     """Return a system by name, with another's options where names match and its own preset's otherwise, if it has that
     preset. Plain Gaussians take the degree that the other starts from: with degree 0 they are strongest in the bytes of
     `bytewise`. Options set by an instance take precedence. Raises ValueError if there is no such system."""
-    found = find_system(name)
-    kind = type(found)
-    system = like(kind() if preset is None else kind.presets().get(preset, kind()), other)
+    system = find_system(name)
+    kind = type(system)
+    usual = kind() if preset is None else kind.presets().get(preset, kind())
+    alike = like(usual, other)
     if name in PLAIN:
-        system = dataclasses.replace(system, sh_degree=other.initial_sh_degree)
-    return changed_config(system, own_options(found, kind()), name)
+        alike = dataclasses.replace(alike, sh_degree=other.initial_sh_degree)
+    return changed_config(alike, own_options(system, kind()), name)
 
 
 def scene_place(scene: str, folder: Path = Path()) -> str:
@@ -204,9 +205,9 @@ def read_run_file(path: Path) -> RunRecord:
     unknown or of another type."""
     if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such configuration file")
-    data, where = read_regular(path, MOST_TOML_BYTES), f"{path}:"
+    where = f"{path}:"
     try:
-        table = parse_toml(data)
+        table = parse_toml(read_regular(path, MOST_TOML_BYTES))
     except ValueError as error:
         raise ValueError(f"{path}: is not valid TOML: {shortened(str(error), 200)}") from error
     for key in table:
@@ -221,57 +222,64 @@ def read_run_file(path: Path) -> RunRecord:
     # The options' class depends on system and preset, so they are read last.
     options = table.pop("options", {})
     record = config_from_dict(RunRecord, table, where, given={"scene": scene, "options": Bytewise()})
-    tables = {"options": options, **{f"compare_options.{key}": value for key, value in record.compare_options.items()}}
-    for key, value in tables.items():
-        if not isinstance(value, Mapping):
-            raise ValueError(f"{where} {shortened(key)} must be a table of options; got {shortened(value)}")
+    _check_table("options", options, where)
+    for name, given in record.compare_options.items():
+        _check_table(f"compare_options.{name}", given, where)
     start = chosen_system(record.system, record.preset)
-    if not is_of_run:
-        system = changed_config(start, options, f"{path}: options")
-        return dataclasses.replace(record, options=system).placed(path.parent)
-    # A run's file has every option but None. Presets may have other values since, so that what is missing is as in the
-    # preset "paper", where options of later versions change nothing.
-    system = changed_config(chosen_system(record.system), options, f"{path}: options")
     compared = dict(record.compare_options)
-    for name in record.compare:
-        own = own_options(compared_system(name, system), system)
-        compared[name] = merged(own, compared.get(name, {}))
+    if is_of_run:
+        # A run's file has every option but None. Presets may have other values since, so that what is missing is as in
+        # the preset "paper", where options of later versions change nothing.
+        start = chosen_system(record.system)
+    system = changed_config(start, options, f"{path}: options")
+    if is_of_run:
+        for name in record.compare:
+            usual = own_options(compared_system(name, system), system)
+            compared[name] = merged(usual, compared.get(name, {}))
     return dataclasses.replace(record, options=system, compare_options=compared).placed(path.parent)
+
+
+def _check_table(key: str, value: object, where: str) -> None:
+    if not isinstance(value, Mapping):
+        raise ValueError(f"{where} {shortened(key)} must be a table of options; got {shortened(value)}")
 
 
 def write_record(run: RunFolder, record: RunRecord) -> None:
     """Write run.toml with every option, so that later versions with other defaults repeat the same run."""
-    usual, scene, compared = chosen_system(record.system), config_to_dict(record.scene), {}
-    for name in record.compare:  # Options not taken from the main system, and given ones.
-        start = compared_system(name, record.options)
-        own = own_options(record.systems[label_of(name)], record.options)
-        compared[name] = _without_none(merged(own, record.compare_options.get(name, {})), config_to_dict(start))
-    table = {
-        **{key: scene[name] for key, name in SCENE_KEYS.items()},
-        "system": record.system,
-        **({} if record.preset is None else {"preset": record.preset}),
-        "compare": list(record.compare),
-        "on_nan": record.on_nan,
-        **({} if record.init is None else {"init": record.init}),
-        **({} if record.file_budget is None else {"file_budget": record.file_budget}),
-        "version": version("a2tg-jax"),
-        "options": _without_none(config_to_dict(record.unbudgeted().options), config_to_dict(usual)),
-        **({"compare_options": compared} if compared else {}),
-    }
+    scene = config_to_dict(record.scene)
+    table: dict[str, Any] = {key: scene[name] for key, name in SCENE_KEYS.items()}
+    for name in ("system", "preset", "compare", "on_nan", "init", "file_budget"):
+        value = getattr(record, name)
+        if value is not None:
+            table[name] = value
+    table["version"] = version("a2tg-jax")
+    options = config_to_dict(record.unbudgeted().options)
+    table["options"] = _without_none(options, config_to_dict(chosen_system(record.system)))
+    compared = {}
+    for name in record.compare:
+        # Options that are not taken from the main system, and given ones.
+        kept = own_options(record.systems[label_of(name)], record.options)
+        kept = merged(kept, record.compare_options.get(name, {}))
+        compared[name] = _without_none(kept, config_to_dict(compared_system(name, record.options)))
+    if compared:
+        table["compare_options"] = compared
     text = f"# Repeats the run: {repeating_command(run)}\n"
-    if record.options.memory_budget is not None and (caps := record.options.caps()):
+    caps = record.options.caps()
+    if caps and record.options.memory_budget is not None:
         text += f"# options.memory_budget decides instead of {', '.join(f'options.{name}' for name in caps)}\n"
     write_whole(run.own(run.record), text + tomli_w.dumps(table))
 
 
-def _without_none(table: dict[str, object], start: dict[str, Any]) -> dict[str, Any]:
-    """Drop None, which TOML lacks, but write "None", as on the command line, if `start` has another value."""
+def _without_none(table: dict[str, Any], usual: dict[str, Any]) -> dict[str, Any]:
+    """Drop None, which TOML lacks, but write "None", as on the command line, if the usual value is another."""
     kept: dict[str, Any] = {}
     for name, value in table.items():
         if isinstance(value, dict):
-            kept[name] = _without_none(value, start[name])
-        elif value is not None or start[name] is not None:
-            kept[name] = "None" if value is None else value
+            kept[name] = _without_none(value, usual[name])
+        elif value is not None:
+            kept[name] = value
+        elif usual[name] is not None:
+            kept[name] = "None"
     return kept
 
 
@@ -290,171 +298,22 @@ def read_record(run: RunFolder) -> RunRecord:
         raise ValueError(f"{shortened(reason, LONGEST_REASON)}{other}") from error
 
 
-def contradictions(asked: RunRecord, kept: RunRecord) -> list[str]:
+def contradictions(wanted: RunRecord, kept: RunRecord) -> list[str]:
     """Return the options, named as in run.toml, in which a record differs from the run to resume. The scene's path, the
     systems to compare and `on_nan` may differ."""
-    before, now = (
-        {"system": one.system, "preset": one.preset, "init": one.init, **flatten_config(one.scene)}
-        | flatten_config(one.options)
-        for one in (kept, asked)
-    )
-    return [name for name, value in now.items() if name != "path" and (name not in before or before[name] != value)]
+    before = _comparable(kept)
+    now = _comparable(wanted)
+    return [name for name in now if name not in before or before[name] != now[name]]
+
+
+def _comparable(record: RunRecord) -> dict[str, Any]:
+    values = {"system": record.system, "preset": record.preset, "init": record.init}
+    values |= flatten_config(record.scene)
+    values |= flatten_config(record.options)
+    del values["path"]
+    return values
 
 
 def is_finished(run: RunFolder, record: RunRecord) -> bool:
     """Return whether all stages of a run have their models."""
     return all(is_regular(run.model(name)) for name in record.plan.names)
-
-
-def training_command(run: RunFolder, out: str, *flags: str) -> str:
-    """Return the command line that trains with the options of a run, into another folder."""
-    return shlex.join(["a2tg", "train", "--config", str(run.record), *flags, "--out", out])
-
-
-def repeating_command(run: RunFolder) -> str:
-    """Return the command line that repeats a run, and its finishing, if any."""
-    is_finished, again = is_regular(run.finish), f"{run.path}-again"
-    trained = f"{run.path}-trained" if is_finished else again
-    training = training_command(run, trained)
-    if not is_finished:
-        return training
-    flags = [f"--{name.replace('_', '-')}={value}" for name, value in config_to_dict(read_finish(run)).items()]
-    return f"{training} && {shlex.join(['a2tg', 'finish', trained, '--out', again, *flags])}"
-
-
-# Finishing
-
-
-@dataclasses.dataclass(frozen=True)
-class FinishOptions:
-    """Options of `a2tg finish`, as in a finished run's finish.json."""
-
-    max_loss: float = 0.02
-    """Largest loss of PSNR in dB by smaller textures, on training views; 0 leaves textures unchanged."""
-    polish_steps: int = 5
-    """Steps of least squares, each of which draws every training view; too many overfit these views, and 0 leaves
-    colours unchanged."""
-
-    def check(self) -> None:
-        """Raise ValueError if a number is out of range."""
-        if not 0 <= self.max_loss < math.inf:
-            raise ValueError(f"max_loss must be at least 0 dB; got {self.max_loss}")
-        if self.polish_steps < 0:
-            raise ValueError(f"polish_steps must be at least 0; got {self.polish_steps}")
-
-
-def read_finish(run: RunFolder) -> FinishOptions:
-    """Return the options with which a run was finished. Raises ValueError if finish.json is damaged or of another
-    version."""
-    data = read_json(run.finish)
-    names = [field.name for field in dataclasses.fields(FinishOptions)]
-    own = {name: data[name] for name in names if name in data} if isinstance(data, dict) else data
-    return config_from_dict(FinishOptions, own, f"{run.finish}:")
-
-
-# Plan
-
-
-@dataclasses.dataclass(frozen=True)
-class PlannedStage:
-    """Stage of a system, shared by all systems with the same beginning."""
-
-    name: str
-    """Name of its files, columns and captions, unique in the run."""
-    system: System
-    """First system that has the stage."""
-    index: int
-    """Index of the stage in its system, from 0."""
-    start: str | None
-    """Name of the stage whose model it starts from; None for a first stage."""
-    stage: Stage = dataclasses.field(repr=False, compare=False)
-
-    @property
-    def checkpoint_every(self) -> int:
-        """Number of iterations between its checkpoints."""
-        # At least ten in a stage, so that a killed short one loses a tenth at most.
-        return max(1, min(LONGEST_WITHOUT_CHECKPOINT, self.stage.iterations // 10))
-
-
-@dataclasses.dataclass(frozen=True)
-class RunPlan:
-    """The stages of a run in the order in which they are trained."""
-
-    stages: tuple[PlannedStage, ...]
-    chains: Mapping[str, tuple[str, ...]]
-    """The stages of each system, by its label; the main system's first."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(planned.name for planned in self.stages)
-
-    @property
-    def main(self) -> tuple[str, ...]:
-        """The stages of the main system."""
-        return next(iter(self.chains.values()))
-
-    @property
-    def kept_states(self) -> tuple[str, ...]:
-        """The stages whose state at the end is kept: each system's last, and those that another one continues."""
-        ends = {chain[-1] for chain in self.chains.values()}
-        continued = {planned.start for planned in self.stages if planned.stage.continues}
-        return tuple(name for name in self.names if name in ends | continued)
-
-    def __getitem__(self, name: str) -> PlannedStage:
-        """Return the stage of this name. Raises ValueError if there is none."""
-        for planned in self.stages:
-            if planned.name == name:
-                return planned
-        raise ValueError(f"the run has the models {', '.join(self.names)}; got {name!r}")
-
-    def first_iteration(self, name: str) -> int:
-        """Return the number of iterations in the stages before a stage."""
-        start = self[name].start
-        return 0 if start is None else self.first_iteration(start) + self[start].stage.iterations
-
-
-def plan_run(systems: Mapping[str, System]) -> RunPlan:
-    """Return the stages of systems by label, the main one first. Two systems share their stages up to the first that
-    differs. Raises ValueError if two stages would have the same name."""
-    planned: list[PlannedStage] = []
-    chains: dict[str, tuple[str, ...]] = {}
-    for label, system in systems.items():
-        chain: list[str] = []
-        stages = system.all_stages()
-        for index, stage in enumerate(stages):
-            # Further stages leave the options of the ones before as they were.
-            num_more = max(0, index + 1 - len(stages) + len(system.more))
-            own = system if num_more == len(system.more) else dataclasses.replace(system, more=system.more[:num_more])
-            wanted = PlannedStage(f"{label}-{stage.name}", own, index, chain[-1] if chain else None, stage)
-            # Training both would give the same model, bit for bit.
-            shared = next(
-                (
-                    known
-                    for known in planned
-                    if (known.index, known.start) == (wanted.index, wanted.start)
-                    and common_options(known.system) == common_options(system)
-                    and is_equal(known.stage, stage)
-                ),
-                None,
-            )
-            if shared is None:
-                if wanted.name in {known.name for known in planned}:
-                    raise ValueError(f"two stages of the run are called {wanted.name!r}")
-                planned.append(wanted)
-            chain.append((shared or wanted).name)
-        chains[label] = tuple(chain)
-    return RunPlan(tuple(planned), chains)
-
-
-def common_options(system: System) -> list[Any]:
-    """Return the options that training reads from the system directly."""
-    return [getattr(system, each.name) for each in dataclasses.fields(System) if each.name not in STAGE_OPTIONS]
-
-
-def is_equal(a: Stage, b: Stage) -> bool:
-    """Return whether two stages are equal in everything, arrays and classes included."""
-    (leaves, structure), (others, other) = jax.tree.flatten(a), jax.tree.flatten(b)
-    # jax.tree compares classes and static fields; arrays are leaves, which == does not reduce to one bool.
-    if structure != other:  # type: ignore[operator]
-        return False
-    return all(np.array_equal(np.asarray(x), np.asarray(y)) for x, y in zip(leaves, others, strict=True))

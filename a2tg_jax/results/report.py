@@ -21,10 +21,12 @@ from a2tg_jax.host.source_commit import source_commit
 from a2tg_jax.host.text import in_bytes
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.measure.evaluation import Evaluation
+from a2tg_jax.results.commands import repeating_command, training_command
 from a2tg_jax.results.figures import ReportFigure
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.images import file_uri, jpeg_uri
-from a2tg_jax.results.record import RunPlan, RunRecord, repeating_command, training_command
+from a2tg_jax.results.plan import RunPlan
+from a2tg_jax.results.record import RunRecord
 
 QUALITIES = (("PSNR (dB)", "psnr", 2), ("SSIM", "ssim", 4), ("LPIPS", "lpips", 4))
 """Rows of the summary: name, metric, and decimals."""
@@ -116,16 +118,13 @@ class RunResult:
 def metrics_json(result: RunResult) -> dict[str, Any]:
     """Return the content of metrics.json."""
     models = {}
-    for name, measured in result.models.items():
-        counts = {key: value for key, value in vars(measured).items() if key != "splits"}
-        splits = {
-            split: {
-                "psnr": found.psnr, "ssim": found.ssim, "lpips": found.lpips, "flat_psnr": found.flat_psnr,
-                "views": len(found.per_view),
-            }
-            for split, found in measured.splits.items()
-        }  # fmt: skip
-        models[name] = {**splits, **counts, "frames_per_second": measured.shown.frames_per_second}
+    for name, model in result.models.items():
+        facts: dict[str, Any] = {}
+        for split, evaluation in model.splits.items():
+            facts[split] = {metric: getattr(evaluation, metric) for metric in ("psnr", "ssim", "lpips", "flat_psnr")}
+            facts[split]["views"] = len(evaluation.per_view)
+        facts |= {key: value for key, value in vars(model).items() if key != "splits"}
+        models[name] = facts | {"frames_per_second": model.shown.frames_per_second}
     return {
         "scene": result.scene,
         "main": result.main,
@@ -138,13 +137,14 @@ def metrics_json(result: RunResult) -> dict[str, Any]:
 
 def per_view_json(result: RunResult) -> dict[str, Any]:
     """Return the content of per_view.json: model → train, test or validation → view → metrics."""
-    return {
-        name: {
-            split: {view.name: {"psnr": view.psnr, "ssim": view.ssim, "lpips": view.lpips} for view in found.per_view}
-            for split, found in measured.splits.items()
-        }
-        for name, measured in result.models.items()
-    }
+    models: dict[str, Any] = {}
+    for name, model in result.models.items():
+        models[name] = {}
+        for split, evaluation in model.splits.items():
+            models[name][split] = {
+                view.name: {"psnr": view.psnr, "ssim": view.ssim, "lpips": view.lpips} for view in evaluation.per_view
+            }
+    return models
 
 
 def versions() -> dict[str, str]:
@@ -164,28 +164,33 @@ def summary_table(result: RunResult, names: Sequence[str]) -> tuple[list[str], l
     """Return titles and rows of the summary table: a column for each model, a row for each metric present."""
     models = [result.models[name] for name in names]
     rows = []
-    for split in dict.fromkeys(split for measured in models for split in measured.splits):
+    splits: dict[str, Evaluation] = {}
+    for model in models:
+        splits |= model.splits
+    for split in splits:
         views, _, way = split.partition("_")
         title = f"{views}, {WAYS[way]}:" if way else views
-        for name, figure, digits in QUALITIES:
-            values = [getattr(measured.splits.get(split), figure, None) for measured in models]
-            rows.append([f"{title} {name}", *("" if value is None else f"{value:.{digits}f}" for value in values)])
-    figures = [
-        {
-            "Gaussians": f"{found.num_gaussians:,}",
-            "texels a Gaussian": f"{found.num_texels / found.num_gaussians:.2f}" if found.num_texels else "",
-            "memory (MB)": megabytes(found.num_bytes),
-            "as published (MB)": (
-                megabytes(found.num_published_bytes) if found.num_published_bytes != found.num_bytes else ""
-            ),
-            "padding (MB)": megabytes(found.num_padding_bytes) if found.num_padding_bytes else "",
-            "frames a second": f"{found.shown.frames_per_second:.1f}",
-            "time of the stage": minutes(found.seconds),
-        }
-        for found in models
-    ]
-    rows += [[name, *(column[name] for column in figures)] for name in figures[0]]
+        for quality, metric, digits in QUALITIES:
+            values = [getattr(model.splits.get(split), metric, None) for model in models]
+            rows.append([f"{title} {quality}", *("" if value is None else f"{value:.{digits}f}" for value in values)])
+    columns = [_figures(model) for model in models]
+    for title in columns[0]:
+        rows.append([title, *(column[title] for column in columns)])
     return ["", *names], [row for row in rows if any(row[1:])]
+
+
+def _figures(model: ModelResult) -> dict[str, str]:
+    """Return the rows of the summary table under its metrics; empty texts for what a model lacks."""
+    has_other_format = model.num_published_bytes != model.num_bytes
+    return {
+        "Gaussians": f"{model.num_gaussians:,}",
+        "texels a Gaussian": f"{model.num_texels / model.num_gaussians:.2f}" if model.num_texels else "",
+        "memory (MB)": megabytes(model.num_bytes),
+        "as published (MB)": megabytes(model.num_published_bytes) if has_other_format else "",
+        "padding (MB)": megabytes(model.num_padding_bytes) if model.num_padding_bytes else "",
+        "frames a second": f"{model.shown.frames_per_second:.1f}",
+        "time of the stage": minutes(model.seconds),
+    }
 
 
 def summary_text(result: RunResult, width: int | None = None) -> str:
@@ -197,7 +202,8 @@ def summary_text(result: RunResult, width: int | None = None) -> str:
     # Columns wrap into blocks, each of which repeats the names of the rows.
     blocks = [[names]]
     for column in columns:
-        if len(blocks[-1]) > 1 and max(map(len, aligned([*blocks[-1], column]))) > width:
+        wider = aligned([*blocks[-1], column])
+        if len(blocks[-1]) > 1 and max(map(len, wider)) > width:
             blocks.append([names])
         blocks[-1].append(column)
     lines = "\n\n".join("\n".join(aligned(block)) for block in blocks).split("\n")
@@ -210,7 +216,9 @@ def summary_text(result: RunResult, width: int | None = None) -> str:
             used = result.models[name].num_bytes
             lines.append(f"{name} takes {used:,} bytes of its budget of {budget:,} ({100 * used / budget:.2f} %)")
     lines += learning_lines(result)
-    lines += [line] if (line := photographs_line(result)) else []
+    photographs = photographs_line(result)
+    if photographs:
+        lines.append(photographs)
     for name, gain in result.gains.items():
         lines.append(f"{result.main}: {gain:+.2f} dB over {name}, {bytes_compared(result, name)}")
     return "\n".join(lines)
@@ -218,40 +226,46 @@ def summary_text(result: RunResult, width: int | None = None) -> str:
 
 def bytes_compared(result: RunResult, name: str) -> str:
     """Return the bytes of the main model against another's, for the line about its gain."""
-    own, other = result.models[result.main].num_bytes, result.models[name].num_bytes
-    if abs(own - other) <= EQUAL_BYTES * other:
-        return f"at equal bytes ({megabytes(own)} MB)"
-    ratio = own / max(other, 1)
+    main = result.models[result.main].num_bytes
+    other = result.models[name].num_bytes
+    if abs(main - other) <= EQUAL_BYTES * other:
+        return f"at equal bytes ({megabytes(main)} MB)"
+    ratio = main / max(other, 1)
     times = f"{ratio:.1f}" if ratio >= 1.05 else f"{ratio:.2f}"
-    return f"with {times} times its bytes ({megabytes(own)} MB and {megabytes(other)} MB)"
+    return f"with {times} times its bytes ({megabytes(main)} MB and {megabytes(other)} MB)"
 
 
 def learning_lines(result: RunResult) -> list[str]:
     """Return a warning for each finished model that is no better than one flat colour per training view."""
     return [
-        f"{name} did not learn: {measured.train.psnr:.1f} dB on its training views, where one flat colour per view "
-        f"reaches {measured.train.flat_psnr:.1f} dB"
-        for name, measured in result.models.items()
-        if not measured.train.has_learned
+        f"{name} did not learn: {model.train.psnr:.1f} dB on its training views, where one flat colour per view "
+        f"reaches {model.train.flat_psnr:.1f} dB"
+        for name, model in result.models.items()
+        if not model.train.has_learned
     ]
 
 
 def photographs_line(result: RunResult) -> str:
     """Return what the main model's held-out views say about the photographs; empty without such views."""
-    main, held_out = result.models[result.main], result.record.scene.held_out
+    main = result.models[result.main]
+    held_out = result.record.scene.held_out
     if held_out not in main.splits:
         return ""
-    train, test = main.train.psnr, main.splits[held_out].psnr
-    few = "few photographs; stay near where you stood, or take more"
-    found = few if train - test >= FEW_PHOTOGRAPHS else "views between the photographs are about as good"
-    return f"{train:.1f} dB on training views, {test:.1f} held out: {found}"
+    train = main.train.psnr
+    test = main.splits[held_out].psnr
+    verdict = "views between the photographs are about as good"
+    if train - test >= FEW_PHOTOGRAPHS:
+        verdict = "few photographs; stay near where you stood, or take more"
+    return f"{train:.1f} dB on training views, {test:.1f} held out: {verdict}"
 
 
 def sizes_line(run: RunFolder, result: RunResult) -> str:
     """Return the bytes of the main model in memory and of the files that it has."""
     sizes = [f"{in_bytes(result.models[result.main].num_bytes)} in memory"]
     files = {"as a page": run.viewer, "compressed": run.model(result.main).with_suffix(".a2tgz")}
-    sizes += [f"{in_bytes(path.stat().st_size)} {what} ({path.name})" for what, path in files.items() if path.is_file()]
+    for what, path in files.items():
+        if path.is_file():
+            sizes.append(f"{in_bytes(path.stat().st_size)} {what} ({path.name})")
     return f"size of {result.main}: {', '.join(sizes)}"
 
 
@@ -259,9 +273,10 @@ def aligned(columns: Sequence[tuple[str, ...]]) -> list[str]:
     """Return the lines of a table with its first column left-aligned, all others right-aligned, without empty rows."""
     name_width, *widths = (max(map(len, column)) for column in columns)
     lines = []
-    for name, *cells in (line for line in zip(*columns, strict=True) if any(line[1:])):
-        aligned = (cell.rjust(width) for cell, width in zip(cells, widths, strict=True))
-        lines.append("  ".join([name.ljust(name_width), *aligned]).rstrip())
+    for name, *cells in zip(*columns, strict=True):
+        if any(cells):
+            padded = [cell.rjust(width) for cell, width in zip(cells, widths, strict=True)]
+            lines.append("  ".join([name.ljust(name_width), *padded]).rstrip())
     return lines
 
 
@@ -328,19 +343,22 @@ def write_report(
     pages = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     # Browsers accept only this style and script, by hash, so that no text from a scene can act as one.
     # Pictures are data: URIs, so that the page is one file.
-    policy, inlined = "default-src 'none'; img-src data:", {}
+    policy = "default-src 'none'; img-src data:"
+    inlined = {}
     for name, suffix in (("style", "css"), ("script", "js")):
         text = loader.get_source(pages, f"report.{suffix}")[0]
         # A CSP hash covers the exact text between the tags.
         digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
-        policy, inlined[name] = f"{policy}; {name}-src 'sha256-{digest}'", Markup(text)
-    main, held_out = result.models[result.main], result.record.scene.held_out
+        policy += f"; {name}-src 'sha256-{digest}'"
+        inlined[name] = Markup(text)
+    main = result.models[result.main]
+    held_out = result.record.scene.held_out
     # The main model comes first, where a phone shows it, then its earlier stages, and compared systems last.
     order = [result.main, *reversed(result.plan.main)]
     names = sorted(result.models, key=lambda name: order.index(name) if name in order else len(order))
     titles, rows = summary_table(result, names)
-    best = {(at, column) for at, row in enumerate(rows) for column in _best(row)}
-    own = sum(measured.seconds for name, measured in result.models.items() if name in result.plan.main)
+    seconds = {name: model.seconds for name, model in result.models.items()}
+    main_seconds = sum(seconds[name] for name in result.plan.main if name in seconds)
     leaves = flatten_config(result.record.scene, "scene.") | flatten_config(result.record.options)
     page = pages.get_template("report.html").render(
         **inlined,
@@ -354,10 +372,10 @@ def write_report(
         photographs=photographs_line(result),
         gains=[(name, bytes_compared(result, name), gain) for name, gain in result.gains.items()],
         device=jax.devices()[0].platform.upper(),
-        own_time=minutes(own),
-        other_time=minutes(sum(measured.seconds for measured in result.models.values()) - own),
+        own_time=minutes(main_seconds),
+        other_time=minutes(sum(seconds.values()) - main_seconds),
         megabytes=megabytes,
-        summary=(titles, rows, best),
+        summary=(titles, rows, _marked(rows)),
         rows_shown=[row[0] for row in rows],
         corrections={split.partition("_")[2] for split in main.splits},
         comparisons=views,
@@ -376,25 +394,34 @@ def write_report(
     write_whole(run.own(run.report), page)
 
 
+def _marked(rows: Sequence[Sequence[str]]) -> set[tuple[int, int]]:
+    """Return the (row, column) of the cells with a metric's best value."""
+    marked = set()
+    for index, row in enumerate(rows):
+        for column in _best(row):
+            marked.add((index, column))
+    return marked
+
+
 def _best(row: Sequence[str]) -> list[int]:
     """Return the columns with a metric's best value; none if neither direction is better, or all are equal."""
     is_higher = any(word in row[0] for word in HIGHER_IS_BETTER)
     if not is_higher and not any(word in row[0] for word in LOWER_IS_BETTER):
         return []
     # Cells are compared as printed: values that round to the same text are equally good.
-    values = {at: float(cell.replace(",", "")) for at, cell in enumerate(row[1:], 1) if cell}
+    values = {column: float(cell.replace(",", "")) for column, cell in enumerate(row[1:], 1) if cell}
     best = max(values.values()) if is_higher else min(values.values())
-    found = [at for at, value in values.items() if value == best]
-    return found if len(found) < len(values) else []
+    columns = [column for column, value in values.items() if value == best]
+    return columns if len(columns) < len(values) else []
 
 
 def _views(result: RunResult, names: Sequence[str], split: str) -> Table:
     """Return PSNR and SSIM of each view and model, with model sizes in the titles."""
-    sizes = [f"{name} ({megabytes(result.models[name].num_bytes)} MB)" for name in names]
+    titles = [f"{name} ({megabytes(result.models[name].num_bytes)} MB)" for name in names]
+    rows = []
+    psnrs = []
     # Views come in one order for all models.
-    found = zip(*(result.models[name].splits[split].per_view for name in names), strict=True)
-    rows, best = [], set()
-    for at, views in enumerate(found):
+    for views in zip(*(result.models[name].splits[split].per_view for name in names), strict=True):
         rows.append([views[0].name, *(f"{view.psnr:.2f} / {view.ssim:.4f}" for view in views)])
-        best |= {(at, column) for column in _best(["PSNR", *(f"{view.psnr:.2f}" for view in views)])}
-    return ["view", *sizes], rows, best
+        psnrs.append(["PSNR", *(f"{view.psnr:.2f}" for view in views)])
+    return ["view", *titles], rows, _marked(psnrs)

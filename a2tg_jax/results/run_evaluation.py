@@ -8,6 +8,7 @@ the photograph (`measure.alignment.align_poses`), training cameras to their lear
 
 import dataclasses
 import functools
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -29,8 +30,9 @@ from a2tg_jax.measure.evaluation import Evaluation, evaluate
 from a2tg_jax.measure.metrics import load_lpips
 from a2tg_jax.model import Model
 from a2tg_jax.renderer import Renderer
+from a2tg_jax.results.commands import resuming_command
 from a2tg_jax.results.figures import write_figures
-from a2tg_jax.results.folder import RunFolder, drop_old, resuming_command, write_json
+from a2tg_jax.results.folder import RunFolder, drop_old, write_json
 from a2tg_jax.results.history import read_history
 from a2tg_jax.results.images import (
     ERROR_GAIN,
@@ -42,7 +44,8 @@ from a2tg_jax.results.images import (
     to_uint8,
 )
 from a2tg_jax.results.model_source import settings_of
-from a2tg_jax.results.record import RunPlan, read_record
+from a2tg_jax.results.plan import RunPlan
+from a2tg_jax.results.record import read_record
 from a2tg_jax.results.report import Comparison, ModelResult, RunResult, metrics_json, per_view_json, write_report
 from a2tg_jax.training import System
 from a2tg_jax.training.corrections import learned
@@ -66,8 +69,9 @@ def evaluate_run(run: RunFolder, scene: Scene | None = None, *, lpips_weights: P
     for name, model in models.items():
         check_held_out(model, scene, run.model(name))
     histories = {name: read_history(run.history(name)) for name in models}
-    measured = {
-        name: ModelResult(
+    results = {}
+    for name, model in models.items():
+        results[name] = ModelResult(
             splits=_evaluations(model, scene, plan, plan[name].system, lpips_weights, record.scene.held_out),
             num_gaussians=model.num,
             num_texels=0 if model.textures is None else model.textures.num_texels,
@@ -77,24 +81,23 @@ def evaluate_run(run: RunFolder, scene: Scene | None = None, *, lpips_weights: P
             seconds=histories[name].last_seconds,
             sha256=sha256_of(run.model(name)),
         )
-        for name, model in models.items()
-    }
     if lpips_weights is None:
-        measured = _with_kept_lpips(run, measured)
-    result = RunResult(scene.name, record, plan, measured, is_lpips_kept=lpips_weights is None)
+        results = _with_kept_lpips(run, results)
+    result = RunResult(scene.name, record, plan, results, is_lpips_kept=lpips_weights is None)
     write_json(run.own(run.metrics), metrics_json(result))
     write_json(run.own(run.per_view), per_view_json(result))
     for name, model in models.items():
         if model.origin is not None and model.origin.corrections:  # exposure [3, 4] = [A | b] and pose [6] by view
             write_json(run.own(run.corrections(name)), learned(model.origin))
-    main, settings = models[result.main], settings_of(plan[result.main].system)
+    main = models[result.main]
     save_ply(run.own(run.point_cloud), main, world="upright")
     # Browsers cannot show subclasses of Appearance.
     if main.appearance.is_portable:
         data = encode_web_scene(main, title=f"{scene.name} · {result.main}")
         write_whole(run.own(run.viewer), viewer_html_with(data))
+    camera = (*scene.test, *scene.train)[0].camera
     starts = {name: plan.first_iteration(name) for name in models}
-    figures = write_figures(run, main, (*scene.test, *scene.train)[0].camera, settings, histories, starts)
+    figures = write_figures(run, main, camera, settings_of(plan[result.main].system), histories, starts)
     comparisons = _write_sheets(run, result, models, scene)
     write_report(run, result, comparisons, figures, is_split_by_number=is_split_by_number(record.scene, scene))
     # Until then, the replaced run is the only one with all its models.
@@ -148,16 +151,16 @@ def finished_stages(run: RunFolder, plan: RunPlan) -> list[str]:
 
 def refined_views(views: tuple[View, ...], model: Model) -> tuple[View, ...]:
     """Return training views with the cameras learned in training."""
-    origin = model.origin
-    if origin is None:
+    if model.origin is None:
         return views
-    viewmats = dict(zip(origin.names, origin.viewmats, strict=True))
-
-    def moved(view: View) -> View:
-        viewmat = jnp.asarray(np.asarray(viewmats[view.name], np.float32))
-        return dataclasses.replace(view, camera=dataclasses.replace(view.camera, viewmat=viewmat))
-
-    return tuple(moved(view) if view.name in viewmats else view for view in views)
+    viewmats = dict(zip(model.origin.names, model.origin.viewmats, strict=True))
+    refined = []
+    for view in views:
+        if view.name in viewmats:
+            viewmat = jnp.asarray(np.asarray(viewmats[view.name], np.float32))
+            view = dataclasses.replace(view, camera=dataclasses.replace(view.camera, viewmat=viewmat))
+        refined.append(view)
+    return tuple(refined)
 
 
 def _evaluations(
@@ -166,65 +169,75 @@ def _evaluations(
     """Return the metrics of a model by split. All models of a run get metrics up to exposure and pose if any of its
     systems learns them."""
     settings = settings_of(system)
-    # Together, so that each image size compiles once.
     measure = functools.partial(evaluate, settings=settings, lpips_weights=lpips_weights)
+    # Together, so that each image size compiles once.
     both = measure((*scene.test, *scene.train), model)
-    splits: dict[str, tuple[View, ...]] = {held_out: scene.test} if scene.test else {}
-    found = {split: both[: len(views)] for split, views in splits.items()}
-    found["train"] = both[len(scene.test) :]
+    splits: dict[str, Evaluation] = {}
+    if scene.test:
+        splits[held_out] = both[: len(scene.test)]
+    splits["train"] = both[len(scene.test) :]
     has_exposure = any(planned.system.exposure for planned in plan.stages)
     has_poses = any(planned.system.refine_poses for planned in plan.stages)
-    for split, views in {**splits, "train": scene.train}.items():
+    for split in list(splits):
+        views = scene.train if split == "train" else scene.test
         if has_exposure:
-            found[f"{split}_color_fit"] = measure(views, model, fit_colors=True)
+            splits[f"{split}_color_fit"] = measure(views, model, fit_colors=True)
         if has_poses:
-            moved = refined_views(views, model) if split == "train" else align_poses(views, model, settings=settings)
-            found[f"{split}_aligned"] = measure(moved, model)
+            aligned = refined_views(views, model) if split == "train" else align_poses(views, model, settings=settings)
+            splits[f"{split}_aligned"] = measure(aligned, model)
             if has_exposure:
-                found[f"{split}_aligned_color_fit"] = measure(moved, model, fit_colors=True)
-    return found
+                splits[f"{split}_aligned_color_fit"] = measure(aligned, model, fit_colors=True)
+    return splits
 
 
-def _with_kept_lpips(run: RunFolder, measured: Mapping[str, ModelResult]) -> dict[str, ModelResult]:
-    """Return the metrics with the LPIPS of metrics.json for every model file that is unchanged."""
-
-    def merged(found: Evaluation, kept: Mapping[str, Mapping[str, float]]) -> Evaluation:
-        per_view = tuple(dataclasses.replace(view, lpips=float(kept[view.name]["lpips"])) for view in found.per_view)
-        return dataclasses.replace(found, per_view=per_view, lpips_network=network)
-
+def _with_kept_lpips(run: RunFolder, results: Mapping[str, ModelResult]) -> dict[str, ModelResult]:
+    """Return the results with the LPIPS of metrics.json for every model file that is unchanged."""
+    kept = dict(results)
     try:
-        metrics, per_view = read_json(run.metrics), read_json(run.per_view)
-        network, changed = metrics["lpips_network"], dict(measured)
-        for name, found in measured.items():
+        metrics = read_json(run.metrics)
+        per_view = read_json(run.per_view)
+        network = metrics["lpips_network"]
+        for name, result in results.items():
             # LPIPS belongs to the bytes of a model, not to its name.
-            if network and metrics["models"].get(name, {}).get("sha256") == found.sha256:
-                splits = {split: merged(own, per_view[name][split]) for split, own in found.splits.items()}
-                changed[name] = dataclasses.replace(found, splits=splits)
-        return changed
+            if network and metrics["models"].get(name, {}).get("sha256") == result.sha256:
+                splits = {}
+                for split, evaluation in result.splits.items():
+                    splits[split] = _with_lpips(evaluation, per_view[name][split], network)
+                kept[name] = dataclasses.replace(result, splits=splits)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return dict(measured)  # Never measured, or unreadable.
+        return dict(results)  # Never measured, or unreadable.
+    return kept
+
+
+def _with_lpips(evaluation: Evaluation, values: Mapping[str, Mapping[str, float]], network: str) -> Evaluation:
+    """Return an evaluation with the LPIPS of each view from per_view.json."""
+    views = [dataclasses.replace(view, lpips=float(values[view.name]["lpips"])) for view in evaluation.per_view]
+    return dataclasses.replace(evaluation, per_view=tuple(views), lpips_network=network)
 
 
 def _write_sheets(run: RunFolder, result: RunResult, models: Mapping[str, Model], scene: Scene) -> list[Comparison]:
     """Write a sheet of photograph, renders and error for each view, and return some for the report. Only one view's
     pictures are in memory at a time."""
-    views, names = scene.test or scene.train, [*(result.compared or result.before), result.main]
+    views = scene.test or scene.train
     # The cameras of `evaluate`, so that nothing compiles again.
     cameras = [view.camera for view in (*scene.test, *scene.train)]
-    renderers = [
-        Renderer(models[name], cameras=cameras, settings=settings_of(result.plan[name].system), has_geometry=False)
-        for name in names
-    ]
-    files, reported = picture_names(view.name for view in views), []
+    renderers = {}
+    for name in (*(result.compared or result.before), result.main):
+        settings = settings_of(result.plan[name].system)
+        renderers[name] = Renderer(models[name], cameras=cameras, settings=settings, has_geometry=False)
+    files = picture_names(view.name for view in views)
+    captions = ["photograph", *renderers]
+    every = math.ceil(len(views) / REPORTED_VIEWS)
+    reported = []
     for index, view in enumerate(views):
-        truth = to_uint8(view_image(view, models[result.main].background))
-        renders = [to_uint8(renderer(view.camera).color) for renderer in renderers]
-        images, captions = [truth, *renders], ["photograph", *names]
-        error = error_picture(renders[-1], truth)
+        photograph = to_uint8(view_image(view, models[result.main].background))
+        renders = [to_uint8(renderer(view.camera).color) for renderer in renderers.values()]
+        images = [photograph, *renders]
+        error = error_picture(renders[-1], photograph)
         sheet = side_by_side([*images, error], [*captions, f"error, {ERROR_GAIN} times"])
         save_picture(run.own(run.test / files[view.name]), sheet)
-        if index % -(-len(views) // REPORTED_VIEWS) == 0:
+        if index % every == 0:
             # Where the main model gains most over the first of the others.
-            crop = largest_gain(truth, renders[0], renders[-1]) if len(renders) > 1 else None
+            crop = largest_gain(photograph, renders[0], renders[-1]) if len(renders) > 1 else None
             reported.append(Comparison.of(view.name, images, captions, crop))
     return reported

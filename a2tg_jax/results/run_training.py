@@ -1,77 +1,46 @@
-"""Runs in their folders: begun or resumed, trained stage by stage with checkpoints, and measured.
-
-If several processes train a run, the first one decides and writes files. Before each stage it sends the others the
-checkpoint or model to start from, so that they need no access to the run folder.
-"""
+"""Runs in their folders: begun or resumed, trained stage by stage with checkpoints, and measured."""
 
 import contextlib
 import dataclasses
 import functools
-import hashlib
-import json
-import tempfile
 import warnings
-import zlib
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
 
-import jax
-import numpy as np
-
-from a2tg_jax.data.scene import Scene, views_by_kind
+from a2tg_jax.data.scene import Scene
 from a2tg_jax.finish.tuning import ITERATIONS
 from a2tg_jax.host import signals
 from a2tg_jax.host.errors import error_text
-from a2tg_jax.host.machine import Devices, this_machine
-from a2tg_jax.io.archive import read_archive_header
-from a2tg_jax.io.config_json import flatten_config
+from a2tg_jax.host.machine import Devices
 from a2tg_jax.io.formats import load_splats
-from a2tg_jax.io.model_file import FORMAT, load_model, number_in_file, save_model
-from a2tg_jax.parallel import any_process, broadcast, check_batch_size, leave
-from a2tg_jax.results.compression import SUFFIX, CompressOptions, command_for_file, compress
-from a2tg_jax.results.folder import (
-    DAMAGED,
-    RunFolder,
-    check_apart,
-    check_free,
-    check_output,
-    claimed,
-    iteration_of,
-    put_back_old,
-    resuming_command,
-    set_aside,
-)
+from a2tg_jax.io.model_file import load_model, number_in_file, save_model
+from a2tg_jax.model import Model
+from a2tg_jax.results.commands import file_command, resuming_command
+from a2tg_jax.results.compression import SUFFIX, CompressOptions, compress
+from a2tg_jax.results.folder import RunFolder, check_free, claimed, iteration_of, put_back_old, set_aside
 from a2tg_jax.results.forecast import doubts_about, print_forecast, room_for_photographs, time_after
 from a2tg_jax.results.history import EventWriter, write_history
 from a2tg_jax.results.model_source import check_init, write_first_stage
-from a2tg_jax.results.record import OnNan, PlannedStage, RunPlan, RunRecord, is_finished, read_record, write_record
+from a2tg_jax.results.output_paths import check_apart, check_output
+from a2tg_jax.results.plan import PlannedStage, RunPlan
+from a2tg_jax.results.record import OnNan, RunRecord, is_finished, read_record, write_record
 from a2tg_jax.results.report import RunResult
+from a2tg_jax.results.run_checkpoints import check_finished, last_state, newest_checkpoint
 from a2tg_jax.results.run_evaluation import check_held_out, check_weights, evaluate_run
-from a2tg_jax.training import (
-    Checkpoint,
-    DivergedError,
-    Session,
-    StageResult,
-    System,
-    fit_stage,
-    load_checkpoint,
-    save_checkpoint,
-)
+from a2tg_jax.results.run_processes import check_alike, check_batch_sizes, leave_others, send_stage
+from a2tg_jax.training import Checkpoint, DivergedError, Session, StageResult, fit_stage, save_checkpoint
 from a2tg_jax.training.loop import IsStopped, Watch, never, unwatched
 from a2tg_jax.training.recorded_views import check_names
-from a2tg_jax.training.registry import system_from_dict, system_to_dict
+from a2tg_jax.training.registry import system_to_dict
 from a2tg_jax.training.start import check_loss_data, check_start
 
 LESS_MEMORY = (
     "close other programs, or start another run with a larger `downscale`, or a smaller `memory_budget` or `batch_size`"
 )
-"""Advice on the command line for trainings that run out of memory."""
+"""Advice for trainings that run out of memory."""
 MOST_RESTORED = 5
 """Largest number of restorations of a diverged stage, each with another order of the views."""
-DIFFERING = ("options", "`devices`", "views, cameras or points")
-"""Facts that processes compare with the first one's."""
 Watched = Callable[[Scene], AbstractContextManager[Watch]]
 """Function that returns the watcher of a scene's training."""
 
@@ -115,23 +84,23 @@ def begin_run(record: RunRecord, out: Path, options: RunOptions) -> RunResult:
         another process has claimed the folder; or as `train_run`.
       Stopped: if a signal ends the training; its `advice` says how to continue.
     """
+    # Cheap checks come before the scene is loaded.
     record.check()
-    for system in record.systems.values():
-        check_batch_size(system.batch_size, options.session.num_devices)
+    check_batch_sizes(record, options.session)
     check_weights(options.lpips_weights)
     if not record.scene.is_built_in:
         check_apart(out, Path(record.scene.path))
-    # Cheap checks come before the scene is loaded.
     check_free(out, overwrite=options.overwrite)
     given = None if record.init is None else check_init(Path(record.init), out, record.options)
+    num_given = None if given is None else given.num
     check_output(out)
     scene = record.scene.load(room_for_photographs(options.max_memory))
-    num_given = None if given is None else given.num
     for system in record.systems.values():
         check_loss_data(scene.train, system.all_stages())
         if given is None or system is not record.options:
             check_start(scene, system)
-    if doubts := doubts_about(scene, record):
+    doubts = doubts_about(scene, record)
+    if doubts:
         options.confirm(doubts)
     print_forecast(scene, record, options.max_memory, options.session.num_devices, num_given, out)
     run = RunFolder(out)
@@ -150,47 +119,62 @@ def begin_run(record: RunRecord, out: Path, options: RunOptions) -> RunResult:
 def resume_run(run: RunFolder, options: RunOptions) -> RunResult:
     """Train the stages of a claimed run that are not finished yet, and measure. Raises as `begin_run`."""
     check_weights(options.lpips_weights)
-    record, num_given = read_record(run), None
-    for system in record.systems.values():
-        check_batch_size(system.batch_size, options.session.num_devices)
+    record = read_record(run)
+    check_batch_sizes(record, options.session)
     if is_finished(run, record):
         print(f"{run.path} is finished; to train it on: {resuming_command(run)} --more 2000", flush=True)
     scene = record.scene.load(room_for_photographs(options.max_memory))
-    if record.init is not None:
-        first = run.model(record.plan.main[0])
-        if not first.is_file():
-            write_first_stage(run, record, load_splats(Path(record.init)), scene)
-        num_given = number_in_file(first)
+    if record.init is not None and not run.model(record.plan.main[0]).is_file():
+        write_first_stage(run, record, load_splats(Path(record.init)), scene)
+    num_given = _num_given(run, record)
     print_forecast(scene, record, options.max_memory, options.session.num_devices, num_given)
     return _train_and_measure(run, record, scene, options)
+
+
+def _num_given(run: RunFolder, record: RunRecord) -> int | None:
+    """Return the number of Gaussians of the file that replaces the first stage; None without one."""
+    return None if record.init is None else number_in_file(run.model(record.plan.main[0]))
 
 
 def _train_and_measure(run: RunFolder, record: RunRecord, scene: Scene, options: RunOptions) -> RunResult:
     """Train, measure, and write the file of a file budget. Errors and signals come with advice on how to continue; a
     replaced run is restored if there is no checkpoint yet."""
-
-    def advice() -> str:
-        if put_back_old(run):
-            return f"the run that was in {run.path} is untouched"
-        return how_to_go_on(run, options.session.devices)
-
     try:
         check_alike(record, scene, options.session)
         with signals.noted() as is_stopped, options.watched(scene) as watch:
             train_run(run, scene, options, is_stopped=is_stopped, watch=watch)
-        leave()
+        leave_others()
         result = evaluate_run(run, scene, lpips_weights=options.lpips_weights)
         if record.file_bytes is not None:
             _write_file(run, record, record.file_bytes, scene, progress=options.progress)
         return result
-    except KeyboardInterrupt as stop:
-        number = getattr(stop, "number", signals.CTRL_C)
-        raise signals.Stopped(number, advice()) from None
+    except KeyboardInterrupt as interrupt:
+        number = getattr(interrupt, "number", signals.CTRL_C)
+        raise signals.Stopped(number, _advice(run, options)) from None
     except Exception as error:
         text = error_text(error, LESS_MEMORY)
         if text is None:
             raise
-        raise ValueError(f"{text}; {advice()}") from error
+        raise ValueError(f"{text}; {_advice(run, options)}") from error
+
+
+def _advice(run: RunFolder, options: RunOptions) -> str:
+    if put_back_old(run):
+        return f"the run that was in {run.path} is untouched"
+    return how_to_go_on(run, options.session.devices)
+
+
+def how_to_go_on(run: RunFolder, devices: Devices | None = None) -> str:
+    """Return the path of the newest checkpoint, or else model, and the command that resumes, as `resuming_command`."""
+    names = read_record(run).plan.names
+    kept = "there is no checkpoint yet"
+    for name in names:
+        if run.model(name).is_file():
+            kept = f"the last model is {run.model(name)}"
+    for name in names:
+        for path in run.checkpoints(name):
+            kept = f"the last checkpoint is {path}"
+    return f"{kept}; continue with: {resuming_command(run, devices)}"
 
 
 def _write_file(run: RunFolder, record: RunRecord, max_bytes: int, scene: Scene, *, progress: bool) -> None:
@@ -199,22 +183,15 @@ def _write_file(run: RunFolder, record: RunRecord, max_bytes: int, scene: Scene,
     path = model.with_suffix(SUFFIX)
     if path.is_file() and path.stat().st_size <= max_bytes and path.stat().st_mtime >= model.stat().st_mtime:
         return
-    budget = record.file_budget
+    options = CompressOptions(file_budget=record.file_budget, tune_iterations=ITERATIONS)
     try:
-        options = CompressOptions(file_budget=budget, tune_iterations=ITERATIONS)
-        line = compress(run.path, None, options, scene=scene, progress=progress)
-        print(line, flush=True)
+        print(compress(run.path, None, options, scene=scene, progress=progress), flush=True)
     except ValueError as error:
-        again = command_for_file(run, "SIZE")
-        warnings.warn(f"no file was written: {error}; to try another size: {again}", stacklevel=2)
+        another = file_command(run, "SIZE")
+        warnings.warn(f"no file was written: {error}; to try another size: {another}", stacklevel=2)
 
 
-def how_to_go_on(run: RunFolder, devices: Devices | None = None) -> str:
-    """Return the path of the newest checkpoint, or else model, and the command that resumes, as `resuming_command`."""
-    names = read_record(run).plan.names
-    found = [f"the last model is {run.model(name)}" for name in names if run.model(name).is_file()]
-    found += [f"the last checkpoint is {path}" for name in names for path in run.checkpoints(name)]
-    return f"{['there is no checkpoint yet', *found][-1]}; continue with: {resuming_command(run, devices)}"
+# Training of the stages
 
 
 def train_run(
@@ -228,6 +205,7 @@ def train_run(
         than the record's.
     """
     record = read_record(run)
+    plan = record.plan
     fit = functools.partial(
         fit_stage,
         scene,
@@ -237,34 +215,30 @@ def train_run(
         session=options.session,
         max_memory=options.max_memory,
     )
-    num_given = None if record.init is None else number_in_file(run.model(record.plan.main[0]))
-    to_train = [name for name in record.plan.names if not run.model(name).is_file()]
-    after = time_after(scene, record.plan, to_train, num_given, 0 if record.file_bytes is None else ITERATIONS)
-    for planned in record.plan.stages:
-        path = run.model(planned.name)
+    to_train = [name for name in plan.names if not run.model(name).is_file()]
+    num_tuning = 0 if record.file_bytes is None else ITERATIONS
+    after = time_after(scene, plan, to_train, _num_given(run, record), num_tuning)
+    for planned in plan.stages:
+        name = planned.name
+        path = run.model(name)
         if path.is_file():
-            try:
-                made = read_archive_header(path, format=FORMAT).get("system")
-            except ValueError as error:
-                raise ValueError(f"{error}; delete it to train {planned.name} again") from error
-            if made is not None:  # The first stage may be from a file.
-                _check_options(path, system_from_dict(made, str(path), type(planned.system)), planned.system)
+            check_finished(path, planned)
         else:
-            events = EventWriter(run, planned.name) if options.tensorboard else None
-            own = functools.partial(fit, after=after[planned.name])
-            result = _train_stage(run, record.plan, planned, scene, own, events, record.on_nan)
+            events = EventWriter(run, name) if options.tensorboard else None
+            fit_this = functools.partial(fit, after=after[name])
+            result = _train_stage(run, plan, planned, scene, fit_this, events, record.on_nan)
             if events is not None:
                 events.add(result.history)
                 events.close()
-            write_history(run.own(run.history(planned.name)), result.history)
+            write_history(run.own(run.history(name)), result.history)
             # After the history: a model says that its stage is finished.
             save_model(run.own(path), result.model, {"system": system_to_dict(planned.system)})
         # Also if the model was there: a process may have been killed between the two.
-        if planned.name in record.plan.kept_states:
-            run.keep_state(planned.name, planned.stage.iterations)
-        run.drop_old_checkpoints(planned.name, keep=0)
+        if name in plan.kept_states:
+            run.keep_state(name, planned.stage.iterations)
+        run.drop_all_checkpoints(name)
     # Ends `follow_first_process`.
-    _send_stage(None)
+    send_stage(None)
 
 
 def _train_stage(
@@ -288,25 +262,19 @@ def _train_stage(
 
     num_restored = None
     while True:
-        resume = _newest_checkpoint(run, planned)
-        if events is not None and resume is not None:
-            events.skip(resume.history)
-        # Files, not arrays: other processes read them exactly as the first one does.
-        resumed = None if resume is None else run.checkpoint(planned.name, resume.iteration)
-        model, start = None, None if planned.start is None else run.model(planned.start)
-        if start is not None:
-            model = load_model(start)
-            check_held_out(model, scene, start)
-            if model.origin is not None:
-                trained = [
-                    name for name, is_test in zip(model.origin.names, model.origin.is_test, strict=True) if not is_test
-                ]
-                advice = "restore the photographs, or train in a new folder"
-                check_names(trained, [view.name for view in scene.train], str(start), advice)
-        if resume is None and planned.stage.continues and planned.start is not None:
-            resume = _last_state(run, plan[planned.start], planned.name)
-            resumed = None if resume is None else run.state(planned.start)
-        _send_stage(planned.name, [resumed, start], num_restored)
+        model = None if planned.start is None else _model_to_start(run, planned.start, scene)
+        resume = newest_checkpoint(run, planned)
+        resume_file = None
+        if resume is not None:
+            resume_file = run.checkpoint(planned.name, resume.iteration)
+            if events is not None:
+                events.skip(resume.history)
+        elif planned.stage.continues and planned.start is not None:
+            resume = last_state(run, plan[planned.start], planned.name)
+            resume_file = None if resume is None else run.state(planned.start)
+        # Files, not arrays: other processes read them exactly as this one did.
+        model_file = None if planned.start is None else run.model(planned.start)
+        send_stage(planned.name, [resume_file, model_file], num_restored)
         try:
             return fit(
                 planned.system,
@@ -319,160 +287,36 @@ def _train_stage(
                 num_restored=num_restored,
             )
         except DivergedError as error:
-            before, checkpoints = error.checkpoint, run.checkpoints(planned.name)
-            path = run.own(run.diverged(planned.name, before.iteration))
-            save_checkpoint(path, before)
-            text, num_restored = f"{error}, in {path}", before.num_restored + 1
-            if on_nan == "stop":
-                raise ValueError(f"{text}; `on_nan` restore continues with the views in another order") from error
-            if num_restored > MOST_RESTORED:
-                raise ValueError(f"{text}; the stage was restored {MOST_RESTORED} times already") from error
-            back = f"iteration {iteration_of(checkpoints[-1])}" if checkpoints else "its beginning"
-            order = f"({num_restored} of {MOST_RESTORED} times)"
-            warnings.warn(
-                f"{text}; the stage restarts from {back} with the views in another order {order}", stacklevel=3
-            )
+            num_restored = _restored(run, planned.name, error, on_nan)
 
 
-def _newest_checkpoint(run: RunFolder, planned: PlannedStage) -> Checkpoint | None:
-    """Return the newest readable checkpoint of a stage, made with the same options; None if there are no checkpoints.
-    Raises ValueError if none of them can be read."""
-    damaged: list[tuple[Path, ValueError]] = []
-    # Newest first; after a damaged one, the one before is tried.
-    for path in reversed(run.checkpoints(planned.name)):
-        try:
-            checkpoint = load_checkpoint(path, system=type(planned.system))
-        except ValueError as error:
-            damaged.append((path, error))
-            continue
-        _check_made_alike(path, checkpoint, planned)
-        for damaged_path, damage in damaged:
-            aside = damaged_path.replace(run.own(damaged_path.with_name(damaged_path.name + DAMAGED)))
-            warnings.warn(
-                f"{damage}; it was renamed to {aside.name}, and training continues from {path.name}", stacklevel=2
-            )
-        return checkpoint
-    if damaged:
-        raise ValueError(
-            f"{damaged[0][1]}; there is no other checkpoint: delete it to train {planned.name} from its beginning"
-        )
-    return None
+def _model_to_start(run: RunFolder, start: str, scene: Scene) -> Model:
+    """Return the model of the stage before, after a check that the scene still has its training views."""
+    path = run.model(start)
+    model = load_model(path)
+    check_held_out(model, scene, path)
+    origin = model.origin
+    if origin is not None:
+        trained = [name for name, is_test in zip(origin.names, origin.is_test, strict=True) if not is_test]
+        advice = "restore the photographs, or train in a new folder"
+        check_names(trained, [view.name for view in scene.train], str(path), advice)
+    return model
 
 
-def _last_state(run: RunFolder, before: PlannedStage, name: str) -> Checkpoint | None:
-    """Return the state at the end of a stage, which the stage of that name continues; None, with a warning, if it was
-    not kept. Raises ValueError if it cannot be read, or was made with other options."""
-    path = run.state(before.name)
-    if not path.is_file():
-        warnings.warn(
-            f"{name} continues {before.name} without Adam's moments, so that the first iterations may make pictures "
-            f"worse: there is no {path}",
-            stacklevel=3,
-        )
-        return None
-    try:
-        state = load_checkpoint(path, system=type(before.system))
-    except ValueError as error:
-        raise ValueError(f"{error}; delete it to train {name} without Adam's moments") from error
-    _check_made_alike(path, state, before)
-    return state
-
-
-def _check_made_alike(path: Path, checkpoint: Checkpoint, planned: PlannedStage) -> None:
-    """Raise ValueError if a checkpoint was made with other options than the record's; warn if on another machine."""
-    _check_options(path, checkpoint.system, planned.system)
-    differences = [] if checkpoint.machine is None else checkpoint.machine.differences(this_machine())
-    if differences:
-        warnings.warn(
-            f"{path.name} was made on another machine, so last bits will differ: {'; '.join(differences)}",
-            stacklevel=3,
-        )
-
-
-def _check_options(path: Path, made: System, wanted: System) -> None:
-    """Raise ValueError if a checkpoint or model was made with other options than the record's."""
-    before, now = flatten_config(made), flatten_config(wanted)
-    names = ", ".join(name for name, value in now.items() if before.get(name) != value)
-    if names:
-        raise ValueError(
-            f"{path} was made with another {names} than in run.toml: restore that, or train in a new folder"
-        )
-
-
-# Several processes
-
-
-def check_alike(record: RunRecord, scene: Scene, session: Session) -> None:
-    """Compare options, devices and the scene with the first process; all processes call it together. Raises ValueError
-    if they differ."""
-    if jax.process_count() == 1:
-        return
-    differing = []
-    for name, digest in zip(DIFFERING, digests_of(record, scene, session), strict=True):
-        if any_process(session.mesh, broadcast(digest) != digest):
-            differing.append(name)
-    if differing:
-        raise ValueError(f"the processes have different {' and '.join(differing)}: start all with the same")
-
-
-def digests_of(record: RunRecord, scene: Scene, session: Session) -> list[bytes]:
-    """Return 32 bytes for each of `DIFFERING` that differ if training would. Paths and the pixels of photographs, masks
-    and depth maps are left out."""
-
-    def checksum(x: Any) -> tuple[tuple[int, ...], int]:
-        return np.shape(x), zlib.crc32(np.ascontiguousarray(x).tobytes())
-
-    # A dataclass's repr has every option.
-    systems = [(label, repr(system)) for label, system in record.systems.items()]
-    devices = [] if session.mesh is None else [(one.process_index, one.id) for one in session.mesh.devices.flat]
-    views = []
-    for view in scene.train:
-        has = view.has_alpha, view.mask is not None, view.depth is not None
-        arrays = view.camera.viewmat, view.camera.K
-        views.append((view.name, view.picture.size, has, *map(checksum, arrays)))
-    lenses = [own[0].camera.rays for own in views_by_kind(scene.train)]
-    rays = [None if lens is None else checksum(lens) for lens in lenses]
-    compared = views, rays, checksum(scene.points), checksum(scene.colors), float(scene.scale)
-    return [hashlib.sha256(repr(value).encode()).digest() for value in (systems, devices, compared)]
-
-
-def _send_stage(name: str | None, files: Sequence[Path | None] = (), num_restored: int | None = None) -> None:
-    """Send the other processes the name of the next stage, with the checkpoint and the model that it starts from; None
-    at the end."""
-    if jax.process_count() > 1:
-        broadcast(json.dumps({"name": name, "num_restored": num_restored}).encode())
-        for file in files:
-            broadcast(b"" if file is None else file.read_bytes())
-
-
-def follow_first_process(record: RunRecord, scene: Scene, session: Session) -> None:
-    """Train what the first process sends, until it ends. Raises ValueError as `fit_stage`, and Stopped if a signal ends
-    one of the processes."""
-    check_alike(record, scene, session)
-    plan = record.plan
-
-    def received(path: Path) -> Path | None:
-        data = broadcast(b"")
-        path.write_bytes(data)
-        return path if data else None
-
-    # The first process reports warnings; the others would only repeat them.
-    with warnings.catch_warnings(), signals.noted() as is_stopped, tempfile.TemporaryDirectory() as folder:
-        warnings.simplefilter("ignore")
-        while (header := json.loads(broadcast(b"")))["name"] is not None:
-            planned = plan[header["name"]]
-            resume, start = (received(Path(folder) / name) for name in ("resume.npz", "start.npz"))
-            with contextlib.suppress(DivergedError):  # The first process restores the stage or gives up.
-                fit_stage(
-                    scene,
-                    planned.system,
-                    planned.index,
-                    None if start is None else load_model(start),
-                    resume=None if resume is None else load_checkpoint(resume, system=type(planned.system)),
-                    on_checkpoint=lambda checkpoint: None,
-                    checkpoint_every=planned.checkpoint_every,
-                    progress=False,
-                    is_stopped=is_stopped,
-                    num_restored=header["num_restored"],
-                    session=session,
-                )
+def _restored(run: RunFolder, name: str, error: DivergedError, on_nan: OnNan) -> int:
+    """Keep the state before a divergence, and return the number of restorations with the next one. Raises ValueError if
+    the stage may not be restored."""
+    before = error.checkpoint
+    path = run.own(run.diverged(name, before.iteration))
+    save_checkpoint(path, before)
+    text = f"{error}, in {path}"
+    if on_nan == "stop":
+        raise ValueError(f"{text}; `on_nan` restore continues with the views in another order") from error
+    num_restored = before.num_restored + 1
+    if num_restored > MOST_RESTORED:
+        raise ValueError(f"{text}; the stage was restored {MOST_RESTORED} times already") from error
+    checkpoints = run.checkpoints(name)
+    back = f"iteration {iteration_of(checkpoints[-1])}" if checkpoints else "its beginning"
+    times = f"({num_restored} of {MOST_RESTORED} times)"
+    warnings.warn(f"{text}; the stage restarts from {back} with the views in another order {times}", stacklevel=4)
+    return num_restored

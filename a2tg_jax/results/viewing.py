@@ -9,6 +9,7 @@ import dataclasses
 import functools
 import io
 import json
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -29,9 +30,10 @@ from a2tg_jax.io.other_programs import matrix_of
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.model import Model
 from a2tg_jax.results.compression import loss_measures
-from a2tg_jax.results.folder import check_new, remove_if_empty
+from a2tg_jax.results.folder import remove_if_empty
 from a2tg_jax.results.images import to_uint8
 from a2tg_jax.results.model_source import Source
+from a2tg_jax.results.output_paths import check_new
 from a2tg_jax.results.report import loss_text
 from a2tg_jax.training.loop import IsStopped, StageRun
 from a2tg_jax.training.stage import BACKGROUNDS
@@ -61,19 +63,22 @@ class ServedPhotographs:
     ones."""
 
     def __init__(self, origin: Origin | None, load_scene: Callable[[], Scene | None], background: Color = BLACK):
-        self._names, self._background = () if origin is None else origin.names, background
-        self._load_scene, self._lock = load_scene, threading.Lock()
-        self._found: dict[int, View] | None = None
+        self._names = () if origin is None else origin.names
+        self._load_scene = load_scene
+        self._background = background
+        self._lock = threading.Lock()
+        self._views: dict[int, View] | None = None
 
     @property
     def views(self) -> dict[int, View]:
         """Views by the index of their cameras."""
         with self._lock:  # The server has several threads; the scene is read once.
-            if self._found is None:
+            if self._views is None:
                 scene = self._load_scene() if self._names else None
-                by_name = {} if scene is None else {view.name: view for view in (*scene.train, *scene.test)}
-                self._found = {index: by_name[name] for index, name in enumerate(self._names) if name in by_name}
-            return self._found
+                views = () if scene is None else (*scene.train, *scene.test)
+                by_name = {view.name: view for view in views}
+                self._views = {index: by_name[name] for index, name in enumerate(self._names) if name in by_name}
+            return self._views
 
     def jpeg(self, index: int) -> bytes | None:
         """Return a photograph over the model's background, in its camera's size."""
@@ -107,9 +112,14 @@ class LiveView:
     """View of a training, called between its steps (`training.loop.Watch`); `now` is a clock in seconds."""
 
     def __init__(self, scene: Scene, title: str, now: Callable[[], float] = time.perf_counter):
-        self._scene, self._title, self._now = scene, title, now
-        self._due = self._noted = -np.inf
-        self._paused, self._lock = threading.Event(), threading.Lock()
+        self._scene = scene
+        self._title = title
+        self._now = now
+        self._due = -math.inf
+        """Time of the next snapshot; infinite while one is made."""
+        self._noted = -math.inf
+        self._paused = threading.Event()
+        self._lock = threading.Lock()
         self._encoder: threading.Thread | None = None
         self._scene_bytes: bytes | None = None
         self._status: dict[str, Any] = {"version": 0, "message": "", "stage": ""}
@@ -121,17 +131,23 @@ class LiveView:
         # One snapshot at a time; a paused training is shown as it is now.
         is_free = self._encoder is None or not self._encoder.is_alive()
         if is_free and (self._now() >= self._due or self._paused.is_set()):
-            began = self._now()
-            background, origin = BACKGROUNDS[run.system.background], origin_of_scene(self._scene)
-            # Copied now: the next step donates the state's buffers.
-            model = dataclasses.replace(jax.device_get(run.state.model), background=background, origin=origin)
-            self._due = np.inf  # The thread sets it when done.
-            self._encoder = threading.Thread(target=self._encode, args=(model, began), daemon=True)
-            self._encoder.start()
+            self._take_snapshot(run)
         began = self._now()
         while self._paused.is_set() and not is_stopped():
             time.sleep(WAIT)
         return self._now() - began
+
+    def _take_snapshot(self, run: StageRun) -> None:
+        began = self._now()
+        # Copied now: the next step donates the state's buffers.
+        model = dataclasses.replace(
+            jax.device_get(run.state.model),
+            background=BACKGROUNDS[run.system.background],
+            origin=origin_of_scene(self._scene),
+        )
+        self._due = math.inf
+        self._encoder = threading.Thread(target=self._encode, args=(model, began), daemon=True)
+        self._encoder.start()
 
     @property
     def routes(self) -> dict[str, Route]:
@@ -150,11 +166,12 @@ class LiveView:
             return json.dumps(self._status | {"is_paused": self._paused.is_set()}).encode()
 
     def _note(self, run: StageRun) -> None:
-        history, self._noted = run.history, self._now()  # Assembling a long history takes time.
+        self._noted = self._now()
         left = f", {run.time_left} left in all" if run.time_left else ""
-        found: dict[str, Any] = {"stage": f"{run.stage.name}{left}", "iterations": run.stage.iterations}
+        status: dict[str, Any] = {"stage": f"{run.stage.name}{left}", "iterations": run.stage.iterations}
+        history = run.history  # Assembling a long history takes time.
         if len(history.iteration):
-            found |= {
+            status |= {
                 "iteration": int(history.iteration[-1]),
                 "loss": float(history.loss[-1]),
                 "psnr": float(history.psnr[-1]),
@@ -162,13 +179,13 @@ class LiveView:
                 "bytes": float(history.megabytes[-1]) * 1e6,
             }
         with self._lock:
-            self._status |= found
+            self._status |= status
 
     def _encode(self, model: Model, began: float) -> None:
         try:
-            found = encode_web_scene(model, title=self._title, coder="none")  # Viewed once, on this machine.
+            encoded = encode_web_scene(model, title=self._title, coder="none")  # Viewed once, on this machine.
             with self._lock:
-                self._scene_bytes = found
+                self._scene_bytes = encoded
                 self._status |= {"version": self._status["version"] + 1, "message": ""}
         except Exception as error:  # Shown on the page; training continues.
             with self._lock:
@@ -222,40 +239,55 @@ def export_web(
       ValueError: if browsers cannot show the model, or photographs are missing or requested in one file.
     """
     page, *others = check_page(out, single_file=single_file, photographs=photographs, overwrite=overwrite)
-    data, old = source.encoded, set()
-    if not others:
-        files = {page: viewer_html_with(data).encode()}
-    else:
-        files, views = {out / SCENE_NAME: data}, list[int]()
-        if photographs:
-            found = ServedPhotographs(source.model.origin, source.load_scene, source.model.background)
-            views = sorted(found.views)
-            if not views:
-                raise ValueError("there are no photographs of the model's cameras: leave out `photographs`")
-            files |= {out / photograph_name(index): found.jpeg(index) or b"" for index in views}
-        files[out / PHOTOGRAPHS_NAME] = json.dumps(views).encode()
+    files: dict[Path, bytes] = {}
+    old: set[Path] = set()
+    if others:
+        files[out / SCENE_NAME] = source.encoded
+        pictures = _jpegs(source) if photographs else {}
+        for index, jpeg in pictures.items():
+            files[out / photograph_name(index)] = jpeg
+        files[out / PHOTOGRAPHS_NAME] = json.dumps(list(pictures)).encode()
         files[page] = viewer_html(is_exported=True).encode()  # Last, so that the page never refers to missing files.
         for path in files:
             check_new(path, "`web`", overwrite=overwrite)
         with contextlib.suppress(OSError, ValueError, TypeError):  # There may be no page.
             old = {out / photograph_name(int(index)) for index in read_json(out / PHOTOGRAPHS_NAME)}
         drop_left_over_pages(out)
+    else:
+        files[page] = viewer_html_with(source.encoded).encode()
     # Nothing is written until all files are checked and all contents made.
     for path, content in files.items():
         write_whole(path, content)
     for path in old - set(files):
         path.unlink(missing_ok=True)
         remove_if_empty(path.parent, out)
-    model, size, total = source.model, len(data), sum(map(len, files.values()))
+    with_others = f" with {counted(len(files) - 1, 'file')} next to it" if others else ""
+    lines = _scene_lines(source)
+    lines.append(f"{page}: {in_bytes(sum(map(len, files.values())))}{with_others}")
+    return "\n".join(lines)
+
+
+def _jpegs(source: Source) -> dict[int, bytes]:
+    """Return the photographs of a model's cameras by index. Raises ValueError if there are none."""
+    served_photographs = ServedPhotographs(source.model.origin, source.load_scene, source.model.background)
+    if not served_photographs.views:
+        raise ValueError("there are no photographs of the model's cameras: leave out `photographs`")
+    return {index: served_photographs.jpeg(index) or b"" for index in sorted(served_photographs.views)}
+
+
+def _scene_lines(source: Source) -> list[str]:
+    """Return lines about the scene file of a page: its size and its loss."""
+    model = source.model
+    size = len(source.encoded)
     ratio = f"1/{model.num_bytes / max(size, 1):.1f} of the model's {in_bytes(model.num_bytes)}"
     lines = [f"{model.num:,} Gaussians, whose scene takes {in_bytes(size)}, {ratio}"]
     if model.num:
         # The page's near plane.
         settings = dataclasses.replace(source.settings, near_plane=source.near_plane)
-        again, measures = decode_model(data), loss_measures(model, source.load_scene_or_warn(), settings)
-        lines += [f"{loss_text(loss_of(again))}, {measure}" for measure, loss_of in measures.items()]
-    others_text = f" with {counted(len(files) - 1, 'file')} next to it" if others else ""
-    return "\n".join([*lines, f"{page}: {in_bytes(total)}{others_text}"])
+        decoded = decode_model(source.encoded)
+        for measure, loss_of in loss_measures(model, source.load_scene_or_warn(), settings).items():
+            lines.append(f"{loss_text(loss_of(decoded))}, {measure}")
+    return lines
 
 
 def drop_left_over_pages(out: Path) -> None:
@@ -279,8 +311,7 @@ def export_comparison(sources: Sequence[Source], out: Path, *, overwrite: bool =
         raise ValueError(f"`out` must be the path of a file that ends in .html; got {out}")
     check_new(out, "`out`", overwrite=overwrite)
     first, second = sources
-    one, other = (matrix_of((source.model.origin or Origin.of_cameras([])).transform) for source in sources)
-    if not np.allclose(one, other, rtol=1e-6, atol=1e-4):
+    if not np.allclose(_world(first), _world(second), rtol=1e-6, atol=1e-4):
         raise ValueError(f"{first.title} and {second.title} are in different worlds: give models of one scene")
     titles = [_place_of(source.path) for source in sources]
     if titles[0] == titles[1]:
@@ -289,6 +320,12 @@ def export_comparison(sources: Sequence[Source], out: Path, *, overwrite: bool =
     page = comparison_html(*scenes).encode()
     write_whole(out, page)
     return f"{out}: {in_bytes(len(page))}, {' against '.join(titles)}"
+
+
+def _world(source: Source) -> np.ndarray:
+    """Return the way of a model's world to the original one [4, 4]."""
+    origin = source.model.origin or Origin.of_cameras([])
+    return matrix_of(origin.transform)
 
 
 def _place_of(path: Path) -> str:

@@ -72,11 +72,6 @@ class History(NamedFields):
     def last_seconds(self) -> float:
         return float(self.seconds[-1]) if len(self.seconds) else 0.0
 
-    def with_point(self, /, *point: float, **terms: float) -> "History":
-        """Add a row: values in the order of the fields, and loss terms by name."""
-        row = dict(zip(COLUMNS, point, strict=True)) | {f"{TERM}{name}": value for name, value in terms.items()}
-        return self.followed_by(History.of_rows([row]))
-
     @staticmethod
     def of_rows(rows: Sequence[Mapping[str, float]]) -> "History":
         """Return the history of rows, which map column names to values; NaN for a loss term that a row lacks."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from a2tg_jax.core.budget import LARGEST_SHORTFALL
 from a2tg_jax.core.checks import check_kind, check_untraced, kind_of
-from a2tg_jax.core.gaussians import Gaussians, check_process
+from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.data.scene import Scene, check_scene, origin_of_scene
 from a2tg_jax.data.synthetic import BUILT_IN
@@ -210,7 +210,6 @@ def _check_arguments(
     scene: Scene, system: System, start: Model | None, resume: Checkpoint | None, checkpoint_every: int | None
 ) -> None:
     """Raise ValueError unless the arguments are of their classes, and the training views and the options are valid."""
-    check_process()
     check_untraced("fit")
     is_path = str, os.PathLike
     example = ""

@@ -1,10 +1,9 @@
-"""Writes docs/options.md and a2tg_jax/cli/flags.py from the help of the program: python docs/scripts/options.py"""
+"""Writes docs/options.md from the help of the program: python docs/scripts/options.py"""
 
 import contextlib
 import io
 import os
 import re
-import textwrap
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,8 +12,7 @@ from a2tg_jax.results.record import DEFAULT_SYSTEM
 from a2tg_jax.training import SYSTEMS
 
 PAGE = Path(__file__).resolve().parents[1] / "options.md"
-FLAGS = PAGE.parents[1] / "a2tg_jax" / "cli" / "flags.py"
-FLAGS_OPENING = '''"""Flags of each command, so that a misspelt one is reported without importing the commands.
+OPENING = '''"""Flags of each command, so that a misspelt one is reported without importing the commands.
 
 Written by docs/scripts/options.py.
 """
@@ -119,23 +117,6 @@ def page() -> str:
     return "".join(parts)
 
 
-def flags_module(text: str) -> str:
-    """Return the module of flags, given the whole page. All systems' options are flags of a2tg train."""
-    found: dict[str, set[str]] = {}
-    for part in text.split("\n## ")[1:]:
-        command = re.match(r"`a2tg (\w+)`", part)
-        found.setdefault(command[1] if command else "train", set()).update(re.findall(r"\n\| `--([\w.-]+)", part))
-    lines = ["FLAGS = {"]
-    for name in command_line.COMMANDS:
-        wrapped = textwrap.wrap(" ".join(sorted(found.get(name, ()))), 109, break_on_hyphens=False)
-        lines += (
-            [f'    "{name}": (', *(f'        "{line} "' for line in wrapped), "    ),"]
-            if wrapped[1:]
-            else [f'    "{name}": "{"".join(wrapped)}",']
-        )
-    return FLAGS_OPENING + "\n".join([*lines, "}"]) + "\n"
-
-
 def own_options(of_train: dict[str, list[Option]]) -> dict[str, list[Option]]:
     """Return, for each system, the options that others lack or that have another default there."""
     shared = set.intersection(*(set(options) for options in of_train.values()))
@@ -146,6 +127,4 @@ def own_options(of_train: dict[str, list[Option]]) -> dict[str, list[Option]]:
 
 
 if __name__ == "__main__":
-    text = page()
-    PAGE.write_text(text, encoding="utf-8")
-    FLAGS.write_text(flags_module(text), encoding="utf-8")
+    PAGE.write_text(page(), encoding="utf-8")

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 import a2tg_jax as a2tg
-from a2tg_jax.results.record import common_options, is_equal
+from a2tg_jax.results.plan import common_options, is_equal
 
 PACKAGE = "a2tg_jax"
 LATER_FIELDS = {"continues", "extent"}

@@ -1,0 +1,73 @@
+"""Command lines that messages, run.toml and the report quote. No other module of `results` words them."""
+
+import contextlib
+import math
+import os
+import shlex
+from pathlib import Path
+
+from a2tg_jax.finish.tuning import ITERATIONS
+from a2tg_jax.host.machine import ALONE, Devices
+from a2tg_jax.host.regular_files import is_regular
+from a2tg_jax.io.archive import read_archive_header
+from a2tg_jax.io.config_json import config_from_dict, config_to_dict
+from a2tg_jax.results.finish_record import read_finish
+from a2tg_jax.results.folder import RunFolder
+
+QUICK_SIDE = 640
+"""Longer side of photographs, in pixels, up to which the preset quick takes minutes on two cores."""
+
+
+def training_command(run: RunFolder, out: str, *flags: str) -> str:
+    """Return the command that trains with the options of a run, into another folder."""
+    return shlex.join(["a2tg", "train", "--config", str(run.record), *flags, "--out", out])
+
+
+def repeating_command(run: RunFolder) -> str:
+    """Return the command that repeats a run, and its finishing, if any."""
+    again = f"{run.path}-again"
+    if not is_regular(run.finish):
+        return training_command(run, again)
+    trained = f"{run.path}-trained"
+    options = config_to_dict(read_finish(run))
+    flags = [f"--{name.replace('_', '-')}={value}" for name, value in options.items()]
+    finishing = shlex.join(["a2tg", "finish", trained, "--out", again, *flags])
+    return f"{training_command(run, trained)} && {finishing}"
+
+
+def resuming_command(run: RunFolder, devices: Devices | None = None) -> str:
+    """Return the command that continues a training on these devices; None: the devices of its newest checkpoint."""
+    if devices is None:
+        devices = _devices_of_newest_checkpoint(run)
+    words = ["a2tg", "train", "--out", str(run.path), "--resume"]
+    if devices != ALONE:
+        words += ["--devices", str(devices.each)]
+    if devices.processes > 1:
+        words += ["--coordinator", "HOST:PORT", "--num-processes", str(devices.processes), "--process-id", "I"]
+    return shlex.join(words)
+
+
+def _devices_of_newest_checkpoint(run: RunFolder) -> Devices:
+    # By time: checkpoints of several stages do not sort by name.
+    checkpoints = sorted((run.path / "checkpoints").glob("*.npz"), key=os.path.getmtime)
+    with contextlib.suppress(ValueError, OSError):  # It may be damaged.
+        if checkpoints:
+            return config_from_dict(Devices, read_archive_header(checkpoints[-1]).get("devices", {}), "devices")
+    return ALONE
+
+
+def first_training_command(scene: Path) -> str:
+    """Return the command that trains a scene quickly."""
+    return shlex.join(["a2tg", "train", str(scene), "--out", f"runs/{scene.resolve().name}", "--preset", "quick"])
+
+
+def quick_flags(longest_side: int, downscale: int = 1) -> str:
+    """Return the flags of a quick training with photographs of this longer side, already downscaled by a factor."""
+    downscale *= max(1, math.ceil(longest_side / QUICK_SIDE))
+    return "--preset quick" + (f" --downscale {downscale}" if downscale > 1 else "")
+
+
+def file_command(run: RunFolder, size: str) -> str:
+    """Return the command that writes the tuned file of a size of a finished run."""
+    flags = ["--file-budget", size, "--tune-iterations", str(ITERATIONS)]
+    return shlex.join(["a2tg", "compress", str(run.path), *flags])
