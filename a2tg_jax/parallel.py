@@ -99,11 +99,11 @@ def with_rows_of_views_divided(mesh: Mesh | None, gradients: T) -> T:
 
 
 def whole(tree: T) -> T:
-    """Return arrays as NumPy's, whole in each process."""
+    """Return copies of arrays as NumPy's, whole in each process."""
 
     def read(x: Any) -> np.ndarray:
         is_here = not isinstance(x, jax.Array) or x.is_fully_addressable or x.is_fully_replicated
-        return np.asarray(x if is_here else multihost_utils.process_allgather(x, tiled=True))
+        return np.array(x if is_here else multihost_utils.process_allgather(x, tiled=True))
 
     return jax.tree.map(read, tree)
 
@@ -234,9 +234,13 @@ def joined(place: ProcessPlace | None, advice: Callable[[], str]) -> Iterator[No
         reason = "no Slurm, Open MPI or Kubernetes was found: give HOST:PORT" if is_alone else error
         raise ValueError(f"--coordinator {place.coordinator}: {reason}") from error
     try:
+        # The connections that collectives use are made at the first one, which waits for some seconds only.
+        multihost_utils.sync_global_devices("joined")
         yield
         leave()
     except Exception as error:
+        if not jax.distributed.is_initialized():
+            raise  # The others have left.
         if not is_lost(error):
             # Before JAX's own function at the exit of Python, which would wait for the others and then abort.
             atexit.register(_exit, 2 if isinstance(error, ValueError | OSError) else 1)

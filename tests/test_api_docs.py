@@ -98,7 +98,7 @@ def test_every_argument_and_result_is_described(name):
 
 
 INTERNAL = {
-    "Clock", "CloneSplitPlan", "Coefficients", "Devices", "Event", "Exchange", "KernelRates", "Machine",
+    "Clock", "CloneSplitPlan", "Coefficients", "Devices", "Event", "KernelRates", "Machine",
     "RecordedViews", "RemotePath", "RestOfRun", "Shape", "SplitStatistics", "StageRun", "TrainState",
     "ViewDependence",
 }  # fmt: skip

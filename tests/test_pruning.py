@@ -17,7 +17,6 @@ import a2tg_jax as a2tg
 from a2tg_jax.core.optim import adam_init
 from a2tg_jax.core.pytree import partition
 from a2tg_jax.data.scene import View
-from a2tg_jax.densify import pruning
 from a2tg_jax.densify.pruning import Prune, shown_in
 from a2tg_jax.densify.splitting import SplitByGradient
 from a2tg_jax.events import Due
@@ -99,12 +98,6 @@ def test_a_number_is_kept():
     assert pruned(Prune(keep=120))[-1].model.num == 120
     model, _, _, change = pruned(Prune(keep=1_000))
     assert change.model.num == model.num
-
-
-def test_the_weights_are_those_of_the_first_process(monkeypatch):
-    monkeypatch.setattr(pruning, "of_first", lambda mesh, arrays: [np.arange(len(x)) for x in arrays])
-    change = pruned(Prune(keep=10))[-1]
-    np.testing.assert_array_equal(np.diff(change.rows[:10]), 1)
 
 
 def test_degrees_stay_with_their_gaussians():
