@@ -67,9 +67,9 @@ class MovableKernels(Appearance):
     ) -> tuple[Residual, Factor]:
         totals = [jnp.zeros_like(u)] * 4
         for first in range(0, len(numbers), FLOATS_PER_KERNEL):
-            x, y, sharpness, *values_shown = numbers[first : first + FLOATS_PER_KERNEL]
+            x, y, sharpness, *opacity_and_color = numbers[first : first + FLOATS_PER_KERNEL]
             weight = jnp.exp(-sharpness * ((u - x) * (u - x) + (v - y) * (v - y))) + LEAST_WEIGHT
-            totals = [total + weight * number for total, number in zip(totals, values_shown, strict=True)]
+            totals = [total + weight * number for total, number in zip(totals, opacity_and_color, strict=True)]
         opacity, red, green, blue = (total * (1 / NUM_KERNELS) for total in totals)
         return (red, green, blue), opacity
 

@@ -43,7 +43,8 @@ def check_kind(name: str, value: object, kind: type | tuple[type, ...], hint: st
     for accepted in kind if isinstance(kind, tuple) else (kind,):
         noun = accepted.__name__
         article = "an" if noun[0] in "AEIOUaeiou" else "a"
-        nouns.append(noun if noun.endswith("s") else f"{article} {noun}")  # plural, as Gaussians
+        # Plurals, such as Gaussians, have no article.
+        nouns.append(noun if noun.endswith("s") else f"{article} {noun}")
     raise ValueError(f"{name} must be {' or '.join(nouns)}; got {kind_of(value)}{hint and f': {hint}'}")
 
 

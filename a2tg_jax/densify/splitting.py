@@ -70,7 +70,7 @@ class SplitByGradient(FillingMcmc):
         model, moments, state = split_rows(to_split, moves, model, moments, state)
         cap = min(self.cap, model.gaussians.num)
         least = self.least(now, num_live)
-        # Rows that have moved are smaller now and share their statistic.
+        # Weights again, because moved rows are smaller and share their statistic.
         draw = functools.partial(draw_distinct_hosts, draw_weights(model, state))
         moves = plan_growth(to_add, model.appearance.opacities(model.gaussians), num_live, cap, least, draw)
         model, moments, state = split_rows(now.keys[1], moves, model, moments, state)

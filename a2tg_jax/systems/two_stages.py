@@ -37,7 +37,7 @@ FLOATS_PER_TEXEL = 4
 PRUNING = Prune(at=(0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8))
 NO_PRUNING = dataclasses.replace(PRUNING, share=0.0)
 LAST_PRUNING = 0.8
-"""Latest fraction of the first stage at which Gaussians are pruned; MCMC's growth ends at 5/6."""
+"""Latest fraction of the first stage at which Gaussians are pruned, because MCMC's growth ends at 5/6."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -132,14 +132,13 @@ REACH = 1
 
 
 @pytree
-class RobustPhotometric:
+class RobustPhotometric(Photometric):
     """The photometric loss over inliers: patches without an outlying residual (`inliers`).
 
     Passers-by, cars and shadows are in few photographs, so the model cannot show them, and their residual stays large
     over whole patches. Each step finds them from its own residual, as in RobustNeRF (Sabour et al., 2023).
     """
 
-    ssim_weight: float = 0.2
     share: float = 0.3
     """Largest share of a photograph that is left out."""
     factor: float = 4.0
@@ -148,9 +147,6 @@ class RobustPhotometric:
     """Share of the stage after which something is left out; earlier it would be what is not learned yet."""
     has_ssim: bool = static(default=True)
     """Whether to compute SSIM. Without it, images smaller than its window can be trained on."""
-
-    def __call__(self, model: Model, target: Target, output: RenderOutput) -> Array:
-        return functools.reduce(jnp.add, self.parts(model, target, output).values())
 
     def parts(self, model: Model, target: Target, output: RenderOutput) -> dict[str, Array]:
         residual = jnp.mean(jnp.abs(output.color - target.image), axis=-1)

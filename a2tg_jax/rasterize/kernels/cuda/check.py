@@ -62,7 +62,7 @@ def _failure() -> str | None:
 
 def largest_difference(device: object) -> float:
     """Return the largest difference between kernels and XLA on a GPU, of a textured view's arrays and gradient."""
-    settings, (splats, texels, regions, cutoff, jacobian, probe, g) = _inputs()
+    settings, arrays = _inputs()
 
     def drawn(kernels: Any, *arrays: Any) -> list[Any]:
         splats, texels, regions, cutoff, jacobian, probe, g = arrays
@@ -77,8 +77,8 @@ def largest_difference(device: object) -> float:
 
     with jax.default_device(device):
         draw = jax.jit(drawn, static_argnums=0)
-        results = draw(cuda, splats, texels, regions, cutoff, jacobian, probe, g)
-        references = draw(xla, splats, texels, regions, cutoff, jacobian, probe, g)
+        results = draw(cuda, *arrays)
+        references = draw(xla, *arrays)
     return relative_difference(results, references)
 
 

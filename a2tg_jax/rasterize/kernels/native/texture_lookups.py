@@ -247,13 +247,16 @@ class TexelWriter(Writer):
 
     def transpose_quarters(self, vectors: Sequence[ir.Value]) -> list[ir.Value]:
         """Transpose every four lanes of four vectors as a 4×4 matrix: in pairs, then in pairs of pairs."""
-        low01 = self.shuffle(vectors[0], vectors[1], (0, "0", 1, "1"))
-        low23 = self.shuffle(vectors[2], vectors[3], (0, "0", 1, "1"))
-        high01 = self.shuffle(vectors[0], vectors[1], (2, "2", 3, "3"))
-        high23 = self.shuffle(vectors[2], vectors[3], (2, "2", 3, "3"))
+        a, b, c, d = vectors
+        low = (0, "0", 1, "1")
+        high = (2, "2", 3, "3")
+        low_ab = self.shuffle(a, b, low)
+        low_cd = self.shuffle(c, d, low)
+        high_ab = self.shuffle(a, b, high)
+        high_cd = self.shuffle(c, d, high)
         first = (0, 1, "0", "1")
         second = (2, 3, "2", "3")
-        pairs = (low01, low23, first), (low01, low23, second), (high01, high23, first), (high01, high23, second)
+        pairs = (low_ab, low_cd, first), (low_ab, low_cd, second), (high_ab, high_cd, first), (high_ab, high_cd, second)
         return [self.shuffle(*pair) for pair in pairs]
 
     def shuffle(self, x: ir.Value, y: ir.Value, pattern: Sequence[int | str]) -> ir.Value:
