@@ -9,8 +9,11 @@ from a2tg_jax.cli.main import _with_flags
 
 ROOT = Path(__file__).parent.parent
 PAGE = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
-NOT_OURS = {"Killed", "a2tg render", "os.fork() was called … this will likely lead to a deadlock"}
-"""Code in bold that is no message of the program."""
+NOT_OURS = {
+    "Killed", "a2tg render", "DEADLINE_EXCEEDED", "the JAX distributed service detected fatal errors",
+    "os.fork() was called … this will likely lead to a deadlock",
+}  # fmt: skip
+"""Code in bold that is no message of the program, but of others."""
 QUOTED = {
     " ".join(code.split())
     for bold in re.findall(r"\*\*(.+?)\*\*", PAGE, re.DOTALL)
