@@ -7,7 +7,6 @@ import json
 import pickle
 import threading
 import time
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -206,7 +205,7 @@ def test_shelves_are_filled_and_read_by_many_threads():
 
     def work(start):
         for index in range(start, 60, 4):
-            kept[index] = shelf.keep(images[index], Path("a.png"), np.copy)
+            kept[index] = shelf.keep(images[index])
             time.sleep(0)
             np.testing.assert_array_equal(kept[index].read(), images[index])
 
@@ -226,7 +225,7 @@ def test_a_full_disk(monkeypatch):
 
     monkeypatch.setattr(pictures.tempfile, "TemporaryFile", full)
     with pytest.raises(OSError, match=r"cannot keep the scene's photographs \(No space left.*larger downscale"):
-        Shelf(0).keep(np.zeros((4, 4, 3), np.uint8), Path("a.png"), np.copy)
+        Shelf(0).keep(np.zeros((4, 4, 3), np.uint8))
 
 
 @pytest.mark.parametrize(("kind", "room"), [*((kind, 0) for kind in KINDS), ("undistorted", None)])

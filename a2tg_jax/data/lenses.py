@@ -86,13 +86,13 @@ class Lens:
             )
         return K, size
 
-    def view_pixels(self, pixels: np.ndarray, downscale: int = 1) -> tuple[np.ndarray, np.ndarray]:
-        """Return the pixels [h', w', C] of a photograph's view, and their K [3, 3].
+    def view_pixels(self, pixels: np.ndarray, downscale: int = 1) -> np.ndarray:
+        """Return the pixels [h', w', C] of a photograph's view.
 
         The photograph, [h, w, C] uint8, is of the calibrated size, perhaps scaled. Unless kept, it is undistorted
         before it is downscaled, which keeps it sharp.
         """
-        new_size, K = self.view_of((pixels.shape[1], pixels.shape[0]), downscale)
+        size, _ = self.view_of((pixels.shape[1], pixels.shape[0]), downscale)
         if not (self.is_kept or self.is_pinhole):
             planes = pixels.astype(np.float32)
             if planes.shape[2] == 4:  # Colours are multiplied by alpha, so that transparent neighbours do not bleed.
@@ -101,7 +101,7 @@ class Lens:
             if planes.shape[2] == 4:
                 planes[..., :3] *= 255 / np.maximum(planes[..., 3:], 1)  # Colours are 0 where alpha is.
             pixels = np.clip(np.rint(planes), 0, 255).astype(np.uint8)
-        return resize_pixels(pixels, *new_size), K
+        return resize_pixels(pixels, *size)
 
     def view_of(self, stored: tuple[int, int], downscale: int) -> tuple[tuple[int, int], np.ndarray]:
         """Return (width, height) and K [3, 3] of the view that `view_pixels` makes of a photograph of a size."""

@@ -174,41 +174,29 @@ def _read(files: _Files, options: Options) -> tuple[Shot, Path | None]:
     stored = (width, height)
     lens = _lens_of(files, stored, options.downscale)
     mask = None if files.mask is None else read_mask(files.mask, stored, lens.size)
-    cuts_out = options.mask_as == "background"
-
-    def whole_view(pixels: np.ndarray) -> np.ndarray:
-        """Return the view's pixels from the file's."""
-        if cuts_out and files.mask is not None:
-            # Read again: held masks of all photographs would take much memory.
-            pixels = _cut_out(pixels, read_mask(files.mask, stored, lens.size).counts)
-        return lens.view_pixels(pixels, files.downscale)[0]
-
-    def view(pixels: np.ndarray) -> np.ndarray:
-        pixels = whole_view(pixels)
-        return pixels[..., :3] if options.alpha == "mask" else pixels
-
     try:
         size, K = lens.view_of(stored, files.downscale)
         rays = lens.rays(*size)
     except ValueError as error:
         raise ValueError(f"{photo.what}: its camera model {error}") from None
-    pixels = whole_view(photograph)
-    is_stored = pixels is photograph
+    pixels = photograph
     counts = None
-    if mask is None:
-        counts = None if photo.counted is None else photo.counted(pixels)
-    elif not cuts_out:
+    if mask is not None and options.mask_as == "background":
+        pixels = _cut_out(pixels, mask.counts)
+    elif mask is not None:
         counts = _view_mask(mask.counts, files.mask_downscale, lens, size)
+    pixels = lens.view_pixels(pixels, files.downscale)
+    if mask is None and photo.counted is not None:
+        counts = photo.counted(pixels)
     if options.alpha == "mask" and pixels.shape[2] == 4:
         is_opaque = pixels[..., 3] == 255
         counts = is_opaque if counts is None else is_opaque & counts
         pixels = np.ascontiguousarray(pixels[..., :3])  # A view would keep the alpha channel in memory.
-        is_stored = False
     shot = Shot(
         photo.name,
         photo.viewmat,
         K,
-        options.shelf.keep(pixels, files.image, None if is_stored else view),
+        options.shelf.keep(pixels, files.image if pixels is photograph else None),
         None if counts is None else Mask.of(counts),
         rays,
         None if files.depths is None else _depth_map(files.depths, lens, stored, size),
@@ -359,7 +347,7 @@ def _view_mask(counts: np.ndarray, downscale: int, lens: Lens, view_size: tuple[
     """
     # Pillow takes no [H, W, 1]. Resampled, only 255 from nothing but 255 stays 255.
     planes = np.repeat(np.where(counts, np.uint8(255), np.uint8(0))[..., None], 3, axis=2)
-    planes, _ = lens.view_pixels(planes, downscale)
+    planes = lens.view_pixels(planes, downscale)
     return np.asarray(resize_pixels(planes, *view_size)[..., 0] == 255)
 
 

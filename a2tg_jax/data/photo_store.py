@@ -21,8 +21,6 @@ from a2tg_jax.data.decoding import read_pixels
 from a2tg_jax.host.machine import memory_limit
 from a2tg_jax.host.startup import cache_folder
 
-Processing = Callable[[np.ndarray], np.ndarray]
-"""Function from the pixels in an image file to undistorted or resized ones."""
 SHARE_OF_MEMORY = 0.25
 """Share of the process's memory for photographs; those beyond it stay on disk."""
 
@@ -81,8 +79,7 @@ class Picture(NamedFields):
 
     def __reduce__(self) -> Any:
         """Pickle the pixels; of a photograph that is read unchanged from its file, only the place."""
-        # `view` is a local function, which pickle cannot write.
-        if isinstance(self.read, _FileRead) and self.read.view is None:
+        if isinstance(self.read, _FileRead):
             return Picture, tuple(getattr(self, field.name) for field in dataclasses.fields(self))
         return Picture.of, (self.read(),)
 
@@ -198,21 +195,22 @@ class Shelf:
     """
 
     def __init__(self, room: int | None = None):
-        """Args:
-        room: memory limit of the pictures in bytes; None: `SHARE_OF_MEMORY` of the memory of the process.
+        """Make an empty store.
+
+        Args:
+          room: memory limit of the pictures in bytes; None: `SHARE_OF_MEMORY` of the memory of the process.
         """
         self._room = int(SHARE_OF_MEMORY * memory_limit()) if room is None else room
         self._lock = threading.Lock()
         self._file: BinaryIO | None = None
         self._end = 0
 
-    def keep(self, pixels: np.ndarray, source: Path, view: Processing | None = None) -> Picture:
+    def keep(self, pixels: np.ndarray, source: Path | None = None) -> Picture:
         """Return a picture of these pixels, uint8 of any shape.
 
         Args:
           pixels: the pixels.
-          source: image file that they come from.
-          view: function that made them from the pixels in the file; None: they are exactly these.
+          source: image file with exactly these pixels; None: there is none.
         """
         with self._lock:
             # Smaller pictures may still fit after a larger one did not.
@@ -220,15 +218,10 @@ class Shelf:
             if self._room >= 0:
                 return Picture.of(pixels)
             self._room += pixels.nbytes
-        return self._left(pixels, source, view)
-
-    def _left(self, pixels: np.ndarray, source: Path, view: Processing | None) -> Picture:
-        """Return a picture of pixels without room in memory. Arguments as for `keep`."""
+        # docs/reliability.md, "Photographs beyond the memory"
         checksum = _checksum(pixels)
-        if view is None:
-            # docs/reliability.md, "Photographs beyond the memory"
-            read_again = _FileRead(source, view, checksum)
-            return Picture(pixels.shape, read_again, checksum=checksum)
+        if source is not None:
+            return Picture(pixels.shape, _FileRead(source, checksum), checksum=checksum)
         folder = cache_folder()
         shape = pixels.shape
         try:
@@ -261,21 +254,15 @@ def _checksum(pixels: np.ndarray) -> int:
     return zlib.crc32(np.ascontiguousarray(pixels).data)
 
 
-def _read_file(source: Path, view: Processing | None) -> np.ndarray:
-    stored = read_pixels(source)
-    return np.ascontiguousarray(stored if view is None else view(stored))
-
-
 @dataclasses.dataclass(frozen=True)
 class _FileRead:
     """Function that reads the pixels of an image file, which must not change."""
 
     source: Path
-    view: Processing | None
     checksum: int
 
     def __call__(self) -> np.ndarray:
-        pixels = _read_file(self.source, self.view)
+        pixels = np.ascontiguousarray(read_pixels(self.source))
         if _checksum(pixels) != self.checksum:
             raise ValueError(f"{self.source}: has changed since the scene was loaded; restore it or start again")
         return pixels

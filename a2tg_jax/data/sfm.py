@@ -177,7 +177,7 @@ def _undistort_alpha_and_masks(model: Any, photos: Path, undistorted: Path) -> N
         if target.suffix.lower() == ".png":
             pixels = read_pixels(photos / image.name)
             if pixels.shape[2] == 4:
-                Image.fromarray(lens.view_pixels(pixels)[0]).save(target, "PNG")
+                Image.fromarray(lens.view_pixels(pixels)).save(target, "PNG")
         mask = photos.with_name(MASKS) / f"{image.name}.png"
         if mask.exists():
             levels = lens.view_plane(read_pixels(mask)[..., 0].astype(np.float32))
