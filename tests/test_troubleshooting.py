@@ -10,18 +10,13 @@ from a2tg_jax.cli.main import _with_flags
 ROOT = Path(__file__).parent.parent
 PAGE = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
 NOT_OURS = {
-<<<<<<< HEAD
+NOT_OURS = {
     "Killed",
     "a2tg render",
     "os.fork() was called … this will likely lead to a deadlock",
     "DEADLINE_EXCEEDED",
     "the JAX distributed service detected fatal errors",
 }
-=======
-    "Killed", "a2tg render", "DEADLINE_EXCEEDED", "the JAX distributed service detected fatal errors",
-    "os.fork() was called … this will likely lead to a deadlock",
-}  # fmt: skip
->>>>>>> origin/results
 """Code in bold that is no message of the program, but of others."""
 QUOTED = {
     " ".join(code.split())
