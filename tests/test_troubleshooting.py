@@ -10,7 +10,6 @@ from a2tg_jax.cli.main import _with_flags
 ROOT = Path(__file__).parent.parent
 PAGE = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
 NOT_OURS = {
-NOT_OURS = {
     "Killed",
     "a2tg render",
     "os.fork() was called … this will likely lead to a deadlock",
