@@ -428,6 +428,23 @@ def test_the_smoke_scale_has_few_runs():
     assert len(jobs) <= 36
 
 
+def test_placed_methods_have_the_weight_and_the_new_gaussians_of_bytewise():
+    """In the first stage, up to the number that fills the bytes, and while others are pruned or grow."""
+    grid = read_grid("choose_plain", "claims", scenes=["fox"], validation=True)
+    runs = [run for run in grid.runs({}) if run.cell == grid.cells[0]]
+    placed = [run.job.system for run in runs if run.label.endswith(", placed")]
+    assert len(placed) == 8 and len(runs) == 16
+    for system in placed:
+        first, last = system.stages()
+        place = first.events[-1]
+        assert isinstance(place, a2tg.PlaceByError) and place.iterations(first.iterations)
+        assert place.cap == int(0.3e6) // (4 * {0: 13, 1: 22}[system.sh_degree])
+        weights = [
+            [term.weight for term in stage.losses if getattr(term, "name", "") == "opacity"] for stage in (first, last)
+        ]
+        assert weights == [[0.01], []]
+
+
 def test_a_fingerprint_is_of_what_decides_the_result():
     quick = a2tg.A2tg.preset("quick")
     other = dataclasses.replace(quick, texture=dataclasses.replace(quick.texture, fraction=0.5))
