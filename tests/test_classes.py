@@ -70,9 +70,9 @@ def test_arrays_are_compared_as_a_whole():
 
 
 def test_an_assignment_says_how_to_make_a_changed_copy():
+    """Of pytrees; other dataclasses have Python's own error."""
     scene = a2tg.synthetic_scene(num_views=4, width=24, height=18)
-    own = [scene, scene.train[0].camera, scene.train[0], a2tg.RenderSettings(), a2tg.A2tg(), a2tg.Mcmc(), NoArrays()]
-    for value in own:
+    for value in (scene.train[0].camera, a2tg.Mcmc(), NoArrays()):
         name = dataclasses.fields(value)[0].name
         with pytest.raises(dataclasses.FrozenInstanceError, match=rf"dataclasses.replace\(old, {name}=...\)"):
             setattr(value, name, 1)

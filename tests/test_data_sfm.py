@@ -373,8 +373,7 @@ def test_photographs_stay_as_they_are_whatever_they_are_named(tmp_path):
 @pytest.mark.parametrize("is_terminal", [False, True])
 def test_every_phase_moves_and_colmap_is_silent(tmp_path, capfd, monkeypatch, is_terminal):
     """Phases are bars on a terminal and plain lines in a pipe."""
-    for module in (progress_bars, sfm):
-        monkeypatch.setattr(module, "has_terminal", lambda: is_terminal)
+    monkeypatch.setattr(progress_bars, "has_terminal", lambda: is_terminal)
     save_photos(tmp_path / "photos", 4, 128, 96)
     with contextlib.suppress(ValueError):  # The phases count, not what they find.
         run_sfm(tmp_path / "photos", tmp_path / "scene")
