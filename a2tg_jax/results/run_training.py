@@ -30,7 +30,7 @@ from a2tg_jax.io.archive import read_archive_header
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.io.formats import load_splats
 from a2tg_jax.io.model_file import FORMAT, load_model, number_in_file, save_model
-from a2tg_jax.parallel import any_process, broadcast, check_batch_size, leave
+from a2tg_jax.parallel import any_process, broadcast, leave
 from a2tg_jax.results.compression import SUFFIX, CompressOptions, command_for_file, compress
 from a2tg_jax.results.folder import (
     DAMAGED,
@@ -117,8 +117,6 @@ def begin_run(record: RunRecord, out: Path, options: RunOptions) -> RunResult:
       Stopped: if a signal ends the training; its `advice` says how to continue.
     """
     record.check()
-    for system in record.systems.values():
-        check_batch_size(system.batch_size, options.session.num_devices)
     check_weights(options.lpips_weights)
     # Neither is a folder here.
     if not record.scene.is_built_in and not is_url(record.scene.path):
@@ -153,8 +151,6 @@ def resume_run(run: RunFolder, options: RunOptions) -> RunResult:
     """Train the stages of a claimed run that are not finished yet, and measure. Raises as `begin_run`."""
     check_weights(options.lpips_weights)
     record, num_given = read_record(run), None
-    for system in record.systems.values():
-        check_batch_size(system.batch_size, options.session.num_devices)
     if is_finished(run, record):
         print(f"{run.path} is finished; to train it on: {resuming_command(run)} --more 2000", flush=True)
     scene = record.scene.load(room_for_photographs(options.max_memory))
