@@ -143,7 +143,9 @@ def forecast_stages(
         floats = (model_bytes - shared) / BYTES_PER_FLOAT / num - floats_per_gaussian(system.initial_sh_degree)
         on_host = [event for event in stage.events if isinstance(event, HostEvent)]
         programs = 1 + sum(event.num_programs(stage.iterations) for event in on_host)
-        whole = (STATES + STATES / num_devices) * model_bytes
+        # An event has the old state and the new one; later, the devices get their shares.
+        is_changed = any(event.iterations(stage.iterations) for event in on_host)
+        whole = STATES * (2 if is_changed else 1 + 1 / num_devices) * model_bytes
         seconds = stage.iterations * system.batch_size * (SECONDS_PER_ROW * num + SECONDS_PER_PIXEL * mean_pixels)
         needed = stage_bytes(scene, system, stage, num, model_bytes, num_devices)
         yield StageForecast(needed, model_bytes, num, programs, seconds / num_threads(), whole)
