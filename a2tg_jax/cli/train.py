@@ -28,14 +28,8 @@ from a2tg_jax.host.regular_files import expanded
 from a2tg_jax.host.text import counted, defaulting_to
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.mcmc import Mcmc
-<<<<<<< HEAD
 from a2tg_jax.results.commands import file_command, resuming_command
 from a2tg_jax.results.folder import RunFolder, open_run, opened
-=======
-from a2tg_jax.parallel import AUTO, ProcessPlace, check_batch_size, joined
-from a2tg_jax.results.compression import command_for_file
-from a2tg_jax.results.folder import RunFolder, open_run, opened, resuming_command
->>>>>>> origin/sharding
 from a2tg_jax.results.forecast import room_for_photographs
 from a2tg_jax.results.history import tensorboard_library
 from a2tg_jax.results.record import (
@@ -47,7 +41,7 @@ from a2tg_jax.results.record import (
     write_record,
 )
 from a2tg_jax.results.report import RunResult, sizes_line, summary_text
-from a2tg_jax.results.run_processes import follow_first_process
+from a2tg_jax.results.run_processes import check_batch_sizes, follow_first_process
 from a2tg_jax.results.run_training import RunOptions, begin_run, resume_run, unseen, warn
 from a2tg_jax.results.viewing import shown_live
 from a2tg_jax.systems.a2tg import A2tg
@@ -177,7 +171,7 @@ class Train:
             session = Session(after_compiling=tidy_memory, devices=devices_named(self.devices))
             most = budget_in_bytes(self.max_memory, "max_memory")
             record = self.whole_record if self.resume else with_view_for_each(self.whole_record, session.num_devices)
-            check_batch_size(record.options.batch_size, session.num_devices)
+            check_batch_sizes(record, session)
             if jax.process_index() > 0:  # It trains with the first process and prints nothing.
                 record = self.resumed(open_run(self.out), is_first=False) if self.resume else record
                 follow_first_process(record, record.scene.load(room_for_photographs(most)), session)

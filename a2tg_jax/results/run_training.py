@@ -14,29 +14,11 @@ from a2tg_jax.host import signals
 from a2tg_jax.host.errors import error_text
 from a2tg_jax.host.machine import Devices
 from a2tg_jax.io.formats import load_splats
-<<<<<<< HEAD
 from a2tg_jax.io.model_file import load_model, number_in_file, save_model
 from a2tg_jax.model import Model
 from a2tg_jax.results.commands import file_command, resuming_command
 from a2tg_jax.results.compression import SUFFIX, CompressOptions, compress
 from a2tg_jax.results.folder import RunFolder, check_free, claimed, iteration_of, put_back_old, set_aside
-=======
-from a2tg_jax.io.model_file import FORMAT, load_model, number_in_file, save_model
-from a2tg_jax.parallel import any_process, broadcast, leave
-from a2tg_jax.results.compression import SUFFIX, CompressOptions, command_for_file, compress
-from a2tg_jax.results.folder import (
-    DAMAGED,
-    RunFolder,
-    check_apart,
-    check_free,
-    check_output,
-    claimed,
-    iteration_of,
-    put_back_old,
-    resuming_command,
-    set_aside,
-)
->>>>>>> origin/sharding
 from a2tg_jax.results.forecast import doubts_about, print_forecast, room_for_photographs, time_after
 from a2tg_jax.results.history import EventWriter, write_history
 from a2tg_jax.results.model_source import check_init, write_first_stage
@@ -46,7 +28,7 @@ from a2tg_jax.results.record import OnNan, RunRecord, is_finished, read_record, 
 from a2tg_jax.results.report import RunResult
 from a2tg_jax.results.run_checkpoints import check_finished, last_state, newest_checkpoint
 from a2tg_jax.results.run_evaluation import check_held_out, check_weights, evaluate_run
-from a2tg_jax.results.run_processes import check_alike, check_batch_sizes, leave_others, send_stage
+from a2tg_jax.results.run_processes import check_alike, leave_others, send_stage
 from a2tg_jax.training import Checkpoint, DivergedError, Session, StageResult, fit_stage, save_checkpoint
 from a2tg_jax.training.loop import IsStopped, Watch, never, unwatched
 from a2tg_jax.training.recorded_views import check_names
@@ -102,17 +84,8 @@ def begin_run(record: RunRecord, out: Path, options: RunOptions) -> RunResult:
         another process has claimed the folder; or as `train_run`.
       Stopped: if a signal ends the training; its `advice` says how to continue.
     """
-<<<<<<< HEAD
-=======
-    record.check()
-    check_weights(options.lpips_weights)
-    # Neither is a folder here.
-    if not record.scene.is_built_in and not is_url(record.scene.path):
-        check_apart(out, Path(record.scene.path))
->>>>>>> origin/sharding
     # Cheap checks come before the scene is loaded.
     record.check()
-    check_batch_sizes(record, options.session)
     check_weights(options.lpips_weights)
     if not record.scene.is_built_in:
         check_apart(out, Path(record.scene.path))
@@ -145,12 +118,7 @@ def begin_run(record: RunRecord, out: Path, options: RunOptions) -> RunResult:
 def resume_run(run: RunFolder, options: RunOptions) -> RunResult:
     """Train the stages of a claimed run that are not finished yet, and measure. Raises as `begin_run`."""
     check_weights(options.lpips_weights)
-<<<<<<< HEAD
     record = read_record(run)
-    check_batch_sizes(record, options.session)
-=======
-    record, num_given = read_record(run), None
->>>>>>> origin/sharding
     if is_finished(run, record):
         print(f"{run.path} is finished; to train it on: {resuming_command(run)} --more 2000", flush=True)
     scene = record.scene.load(room_for_photographs(options.max_memory))
