@@ -3,7 +3,6 @@
 import base64
 import dataclasses
 import hashlib
-import io
 import json
 import re
 import subprocess
@@ -13,25 +12,21 @@ from types import SimpleNamespace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from PIL import Image
 from run_folders import NAMES, circle, create_run, some_history, some_result
 
 from a2tg_jax.appearance import Appearance, Bands, Texture
 from a2tg_jax.appearance.parts import empty_bands
 from a2tg_jax.core.gaussians import init_from_points
-from a2tg_jax.core.origin import Origin
 from a2tg_jax.data.load import SceneSource
 from a2tg_jax.host.source_commit import source_commit
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import Geometry
-from a2tg_jax.render import RenderOutput, RenderSettings
+from a2tg_jax.render import RenderOutput
 from a2tg_jax.results.figures import (
-    FLIGHT_FRAMES,
     TEXTURE_SIDE,
     ReportFigure,
     curves_figure,
     depth_picture,
-    flight,
     learned_textures,
     level_colors,
     level_maps,
@@ -39,7 +34,7 @@ from a2tg_jax.results.figures import (
     save_figure,
     sizes_figure,
 )
-from a2tg_jax.results.images import error_picture, largest_gain, save_animation, side_by_side, to_uint8
+from a2tg_jax.results.images import error_picture, largest_gain, side_by_side, to_uint8
 from a2tg_jax.results.report import Comparison, ModelResult, write_report
 from a2tg_jax.results.run_evaluation import is_split_by_number
 from a2tg_jax.texture import textures_from_arrays
@@ -50,7 +45,7 @@ def written_report(folder, result, *, view="a", captions=("b",), figures=(), **o
     run.own(run.point_cloud).touch()
     image = np.zeros((30, 40, 3), np.uint8)
     comparison = Comparison.of(view, [image] * len(captions), captions, largest_gain(image, image, image))
-    places = dict.fromkeys(("curves", "textures", "maps", "geometry", "flight"), ()) | dict(figures)
+    places = dict.fromkeys(("curves", "textures", "maps", "geometry"), ()) | dict(figures)
     write_report(run, result, [comparison], places, **options)
     return run.report.read_text(encoding="utf-8")
 
@@ -266,23 +261,6 @@ def test_figures_are_drawn_within_their_canvas(tmp_path):
         assert box.x0 >= 0 and box.x1 <= figure.bbox.x1
     colors = level_colors(5)
     assert colors.shape == (5, 3) and len(np.unique(colors, axis=0)) == 5 and level_colors(1).shape == (1, 3)
-
-
-def test_a_flight_is_a_small_animation_in_order():
-    cameras = circle(6)
-    model = dataclasses.replace(some_model(), origin=Origin.of_cameras(cameras))
-    moving = Image.open(io.BytesIO(flight(model, RenderSettings())))
-    # Pictures that are alike are one.
-    assert FLIGHT_FRAMES / 2 < moving.n_frames <= FLIGHT_FRAMES and moving.size == (cameras[0].width, cameras[0].height)
-    assert flight(some_model(), RenderSettings()) is None
-    pictures = (Image.new("RGB", (8, 8), (level,) * 3) for level in (0, 72, 144))
-    save_animation(buffer := io.BytesIO(), pictures, 15)
-    moving = Image.open(buffer)
-    shades = []
-    for index in range(3):
-        moving.seek(index)
-        shades.append(np.asarray(moving.convert("RGB"))[4, 4, 0])
-    np.testing.assert_allclose(shades, [0, 72, 144], atol=3)
 
 
 def test_largest_gain_finds_the_square_and_leaves_out_where_both_fail():
