@@ -9,7 +9,7 @@ from lab import tables
 from lab.cli import Experiment, Lab
 from lab.grid import Grid, read_grid
 from lab.markdown import table
-from lab.statistics import Comparison, bootstrap, compare, holm
+from lab.statistics import Comparison, compare, holm
 from lab.tables import EQUAL_TIME, Result
 
 BYTEWISE = "Bytewise"
@@ -82,7 +82,7 @@ def endpoint_texts(one: Endpoint, found: Comparison) -> list[str]:
 
 
 def decision(found: Comparison, p_value: float) -> str:
-    """Return whether an endpoint is decided, given its p-value, corrected where others stand beside it."""
+    """Return whether an endpoint is decided, given its p-value, which is corrected if there are several."""
     return "**decided**" if dataclasses.replace(found, p_value=p_value).is_decided else "undecided"
 
 
@@ -101,10 +101,8 @@ def exploration_table(rows: Sequence[Row]) -> str:
         psnr = found["psnr"]
         if not psnr.by_scene:
             continue
-        low, high = bootstrap(row.differences("psnr"))
         texts = [found[figure].over_scenes.as_text(digits) for figure, digits in tables.DIGITS.items()]
-        drawn = tables.MISSING if np.isnan(low) else f"{low:+.2f} to {high:+.2f}"
-        lines.append([row.name, texts[0], drawn, *texts[1:], f"{psnr.num_won}/{len(psnr.by_scene)}"])
+        lines.append([row.name, texts[0], row.drawn_interval, *texts[1:], f"{psnr.num_won}/{len(psnr.by_scene)}"])
     return table(["`bytewise` −", "ΔPSNR, dB", "bootstrap", "ΔSSIM", "ΔLPIPS", "captures won"], lines)
 
 
@@ -121,7 +119,7 @@ def scenes_table(results: Sequence[Result], others: Sequence[str]) -> str:
         for other in others:
             found = (Row("", block, BYTEWISE, other).compared(figure).by_scene for figure in tables.QUALITY)
             means = (next(iter(by_scene.values()), float("nan")) for by_scene in found)
-            texts = (tables.signed(mean, digits) for mean, digits in zip(means, (2, 3, 3), strict=True))
+            texts = (tables.signed(mean, digits) for mean, digits in zip(means, tables.DIGITS.values(), strict=True))
             gains.append(" / ".join(texts))
         lines.append([label, f"{budget:g}", str(len(own)), tables.quality(own), *gains])
     header = ["capture", "MB", "runs", "`bytewise`: PSNR / SSIM / LPIPS", *(f"− {OTHERS[other]}" for other in others)]
@@ -129,7 +127,7 @@ def scenes_table(results: Sequence[Result], others: Sequence[str]) -> str:
 
 
 def times_text(results: Sequence[Result]) -> str:
-    """Return how long the runs of equal time took beside `bytewise`."""
+    """Return how long the runs of equal time took, compared with `bytewise`."""
     ratios = []
     for _, block in tables.grouped(results, lambda result: result.run.cell):
         times = {result.label: result.record.get("training_seconds") for result in block}
@@ -139,8 +137,8 @@ def times_text(results: Sequence[Result]) -> str:
     if not ratios:
         return ""
     return (
-        f"The last stages of equal time took {min(ratios):.2f} to {max(ratios):.2f} times as long as those of "
-        f"`bytewise`, {np.mean(ratios):.2f} on average, in {len(ratios)} pairs.\n"
+        f"The last stages of equal time took {min(ratios):.2f} to {max(ratios):.2f} times as long as "
+        f"`bytewise`'s, {np.mean(ratios):.2f} on average, in {len(ratios)} pairs.\n"
     )
 
 

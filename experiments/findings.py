@@ -111,6 +111,12 @@ class Row:
     def compared(self, figure: str) -> Comparison:
         return compare(self.differences(figure))
 
+    @property
+    def drawn_interval(self) -> str:
+        """Return the interval of PSNR by the bootstrap for a table, a dash for less than two scenes."""
+        low, high = bootstrap(self.differences("psnr"))
+        return tables.MISSING if np.isnan(low) else f"{low:+.2f} to {high:+.2f}"
+
 
 def rows_of_bytewise(results: Sequence[Result], in_equal_time: Sequence[Result]) -> list[Row]:
     """Return the comparisons of `bytewise`, by stratum and budget. At equal iterations, all runs count. At equal time,
@@ -238,9 +244,8 @@ def table_of(rows: Sequence[Row]) -> str:
         psnr = found["psnr"]
         if not psnr.by_scene:
             continue
-        low, high = bootstrap(row.differences("psnr"))
         lines.append([
-            row.whole_text, with_interval(psnr, "psnr"), "–" if np.isnan(low) else f"{low:+.2f} to {high:+.2f}",
+            row.whole_text, with_interval(psnr, "psnr"), row.drawn_interval,
             with_interval(found["ssim"], "ssim"), with_interval(found["lpips"], "lpips"), *tests_of(psnr),
         ])  # fmt: skip
     return tables.markdown(["", "ΔPSNR, dB", "bootstrap", "ΔSSIM", "ΔLPIPS", "scenes won", "p"], lines)

@@ -46,37 +46,33 @@ class BytewiseByMcmc(Bytewise):
         return dataclasses.replace(first, events=tuple(events)), second
 
 
-def with_weight_and_placing(first: Stage, weight: float, place: PlaceByError) -> Stage:
-    """Return a first stage with the weight on opacities and the new Gaussians of `bytewise`. These come after all other
-    events, up to the number of Gaussians that densification may reach."""
-    cap = max(event.most_gaussians or 0 for event in first.events)
-    events = (*first.events, dataclasses.replace(place, cap=cap))
-    return dataclasses.replace(first, events=events, losses=(*first.losses, Term(opacity, weight)))
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class PlacedMcmc(Gaussians2dMcmc):
-    """Plain 2D Gaussians by MCMC, with the weight on opacities and the new Gaussians of `bytewise`."""
+class Placed:
+    """The weight on opacities and the new Gaussians of `bytewise`, for a plain system.
+
+    New Gaussians come after all other events of the first stage, up to the number that densification may reach.
+    """
 
     fading_weight: float = Bytewise.fading_weight
     place: PlaceByError = PlaceByError()
+
+    def stages(self) -> tuple[Stage, ...]:
+        first, *others = super().stages()
+        cap = max(event.most_gaussians or 0 for event in first.events)
+        events = (*first.events, dataclasses.replace(self.place, cap=cap))
+        losses = (*first.losses, Term(opacity, self.fading_weight))
+        return dataclasses.replace(first, events=events, losses=losses), *others
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PlacedMcmc(Placed, Gaussians2dMcmc):
+    """Plain 2D Gaussians by MCMC, placed."""
 
     name: ClassVar[str] = "placed-mcmc"
 
-    def stages(self) -> tuple[Stage, ...]:
-        first, *others = super().stages()
-        return with_weight_and_placing(first, self.fading_weight, self.place), *others
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class PlacedDensity(Gaussians2d):
-    """Plain 2D Gaussians by clone and split, with the weight on opacities and the new Gaussians of `bytewise`."""
-
-    fading_weight: float = Bytewise.fading_weight
-    place: PlaceByError = PlaceByError()
+class PlacedDensity(Placed, Gaussians2d):
+    """Plain 2D Gaussians by clone and split, placed."""
 
     name: ClassVar[str] = "placed-density"
-
-    def stages(self) -> tuple[Stage, ...]:
-        first, *others = super().stages()
-        return with_weight_and_placing(first, self.fading_weight, self.place), *others
