@@ -93,12 +93,12 @@ def clock(title: str, *, is_shown: bool = True) -> Iterator[None]:
 
 
 @contextmanager
-def ticking(act: Callable[[], object]) -> Iterator[None]:
-    """Call a function every `TICK` seconds, in a thread, until the block ends."""
+def ticking(act: Callable[[], object], seconds: float = TICK) -> Iterator[None]:
+    """Call a function every so many seconds, in a thread, until the block ends."""
     ended = threading.Event()
 
     def tick() -> None:
-        while not ended.wait(TICK):
+        while not ended.wait(seconds):
             act()
 
     thread = threading.Thread(target=tick, daemon=True)

@@ -1,12 +1,13 @@
 """Time of a training without what JAX compiles meanwhile."""
 
-import threading
 import time
 from collections.abc import Iterable
 from typing import Self
 
 import jax
 import numpy as np
+
+from a2tg_jax.host.progress_bars import ticking
 
 COMPILING = (
     "/jax/core/compile/jaxpr_trace_duration",
@@ -36,25 +37,25 @@ class TrainingTime:
         self._clock = time.process_time if jax.default_backend() == "cpu" else time.perf_counter
         self._samples: list[tuple[float, float]] = []
         self._compiled: list[tuple[float, float]] = []
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._sample_until_end, daemon=True)
+        self._sampling = ticking(self._sample, SAMPLING_SECONDS)
+        self._is_over = False
 
     def __enter__(self) -> Self:
         self._sample()
         jax.monitoring.register_event_duration_secs_listener(self._on_event)
-        self._thread.start()
+        self._sampling.__enter__()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._ended.set()
-        self._thread.join()
+        self._sampling.__exit__(None, None, None)
         self._sample()
+        self._is_over = True
         jax.monitoring.unregister_event_duration_listener(self._on_event)
 
     @property
     def seconds(self) -> float:
         """Time so far."""
-        if not self._ended.is_set():
+        if not self._is_over:
             self._sample()
         samples = list(self._samples)
         at, used = np.array(sorted(samples)).T
@@ -65,10 +66,6 @@ class TrainingTime:
 
     def _sample(self) -> None:
         self._samples.append((time.perf_counter(), self._clock()))
-
-    def _sample_until_end(self) -> None:
-        while not self._ended.wait(SAMPLING_SECONDS):
-            self._sample()
 
     def _on_event(self, event: str, seconds: float, **_: object) -> None:
         if event in COMPILING:
