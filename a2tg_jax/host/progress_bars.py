@@ -94,7 +94,7 @@ def clock(title: str, *, is_shown: bool = True) -> Iterator[None]:
 
 @contextmanager
 def ticking(act: Callable[[], object], seconds: float = TICK) -> Iterator[None]:
-    """Call a function every so many seconds, in a thread, until the block ends."""
+    """Call a function repeatedly in a thread, after a pause of `seconds` each time, until the block ends."""
     ended = threading.Event()
 
     def tick() -> None:
