@@ -5,12 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import a2tg_jax as a2tg
-from a2tg_jax.appearance import allocate_appearance
-from a2tg_jax.core.gaussians import init_from_points
-from a2tg_jax.core.origin import Origin
-from a2tg_jax.events import Now
-from a2tg_jax.model import Model
-from a2tg_jax.training import Checkpoint, History
+from a2tg_jax import Checkpoint, History, Model, Now, Origin, allocate_appearance, init_from_points
 from a2tg_jax.training.checkpoint import COLUMNS, TERM
 from a2tg_jax.training.step import initial_state
 

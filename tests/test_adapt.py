@@ -11,17 +11,29 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from a2tg_jax.adapt import Upscale, most_textures, next_sizes, reallocate, select
-from a2tg_jax.appearance import Appearance, Texture, allocate_appearance
+from a2tg_jax import (
+    A2tg,
+    Appearance,
+    Due,
+    GradientStatistics,
+    Model,
+    Texture,
+    Upscale,
+    adam_init,
+    allocate_appearance,
+    allocate_textures,
+    combine,
+    init_from_points,
+    next_sizes,
+    partition,
+    reallocate,
+    select,
+    texture_arrays,
+    textures_from_arrays,
+)
+from a2tg_jax.adapt import most_textures
 from a2tg_jax.core.budget import event_budget
-from a2tg_jax.core.gaussians import init_from_points
-from a2tg_jax.core.optim import adam_init
-from a2tg_jax.core.pytree import combine, partition
 from a2tg_jax.core.table import Shape, plan_places
-from a2tg_jax.events import Due, GradientStatistics
-from a2tg_jax.model import Model
-from a2tg_jax.systems.a2tg import A2tg
-from a2tg_jax.texture import allocate_textures, texture_arrays, textures_from_arrays
 
 ROUND, WIDE, TALL, WIDE_BUT_LARGE = (0.1, 0.1), (0.05, 0.009), (0.009, 0.05), (0.5, 0.02)
 PAPER = {"k_a": 4.0, "k_s": 0.01, "cap": 4}

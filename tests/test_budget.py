@@ -12,18 +12,24 @@ import pytest
 from small_models import some_now
 
 import a2tg_jax as a2tg
-from a2tg_jax.adapt import Upscale
-from a2tg_jax.appearance import Appearance, Texture, allocate_appearance
+from a2tg_jax import (
+    Appearance,
+    Due,
+    FillingDensity,
+    FillingMcmc,
+    GradientStatistics,
+    Model,
+    Texture,
+    Upscale,
+    adam_init,
+    allocate_appearance,
+    init_from_points,
+    partition,
+)
 from a2tg_jax.cli import main as cli
 from a2tg_jax.core.budget import bytes_per_gaussian, megabytes_of, number_to_reach
-from a2tg_jax.core.gaussians import init_from_points, logit
-from a2tg_jax.core.optim import adam_init
-from a2tg_jax.core.pytree import partition
-from a2tg_jax.densify.clone_split import FillingDensity
-from a2tg_jax.events import Due, GradientStatistics
+from a2tg_jax.core.gaussians import logit
 from a2tg_jax.io.config_json import changed_config, config_from_dict, config_to_dict
-from a2tg_jax.mcmc import FillingMcmc
-from a2tg_jax.model import Model
 from a2tg_jax.training.fitting import warn_of_budget
 from a2tg_jax.training.registry import SYSTEMS, system_from_dict, system_to_dict
 from a2tg_jax.training.start import check_start

@@ -7,21 +7,28 @@ import pytest
 from small_values import some_gaussians
 
 import a2tg_jax as a2tg
-from a2tg_jax import Model
-from a2tg_jax.adapt import Upscale
-from a2tg_jax.appearance import Appearance, Bands, Exponents, Texture, allocate_appearance
+from a2tg_jax import (
+    AdaptDegrees,
+    Appearance,
+    Bands,
+    Bytewise,
+    Exponents,
+    HostEvent,
+    LimitExponents,
+    LossConfig,
+    Model,
+    Texture,
+    Upscale,
+    allocate_appearance,
+    load_checkpoint,
+    save_checkpoint,
+)
 from a2tg_jax.appearance.files import arrays_of
 from a2tg_jax.appearance.parts import log_exponents_of
 from a2tg_jax.core.budget import bytes_of, event_budget
 from a2tg_jax.core.pytree import num_compiled
-from a2tg_jax.densify.view_dependence import AdaptDegrees
-from a2tg_jax.events import HostEvent
 from a2tg_jax.io.config_json import changed_config
 from a2tg_jax.results.record import compared_system
-from a2tg_jax.systems.bytewise import Bytewise
-from a2tg_jax.systems.two_stages import LimitExponents
-from a2tg_jax.training import LossConfig
-from a2tg_jax.training.checkpoint import load_checkpoint, save_checkpoint
 from a2tg_jax.training.start import initial_model, padded
 from a2tg_jax.training.step import jitted_step
 

@@ -10,9 +10,8 @@ import pytest
 from lab.fingerprint import fingerprint
 
 import a2tg_jax as a2tg
+from a2tg_jax import Change, Noise
 from a2tg_jax.core.pytree import beside, num_compiled
-from a2tg_jax.events import Change
-from a2tg_jax.mcmc import Noise
 from a2tg_jax.results.plan import plan_run
 
 

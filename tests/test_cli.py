@@ -19,6 +19,7 @@ import pytest
 from PIL import Image
 from run_folders import create_run
 
+from a2tg_jax import find_system, load_model, load_ply, save_model
 from a2tg_jax.cli import doctor, main as cli
 from a2tg_jax.cli.train import Train, train_defaults
 from a2tg_jax.data.load import SceneSource
@@ -26,8 +27,6 @@ from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.host import startup
 from a2tg_jax.host.regular_files import sha256_of
 from a2tg_jax.io.compact import unframed
-from a2tg_jax.io.model_file import load_model, save_model
-from a2tg_jax.io.ply import load_ply
 from a2tg_jax.results import finishing, run_training, viewing
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.frames import LIST
@@ -35,7 +34,7 @@ from a2tg_jax.results.history import read_history
 from a2tg_jax.results.model_source import open_source
 from a2tg_jax.results.record import read_record, write_record
 from a2tg_jax.results.viewing import routes_of
-from a2tg_jax.training import SYSTEMS, find_system
+from a2tg_jax.training import SYSTEMS
 
 TINY = [
     *("--system", "a2tg", "--downscale", "5", "--stage1-iterations", "20", "--stage2-iterations", "20", "--baseline"),

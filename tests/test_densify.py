@@ -9,13 +9,21 @@ import numpy as np
 import pytest
 from small_models import some_now
 
-from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.gaussians import Gaussians, logit, rotation_matrices
-from a2tg_jax.core.optim import adam_init
-from a2tg_jax.core.pytree import partition
-from a2tg_jax.densify.clone_split import CloneSplitPlan, CloneSplitPrune, OpacityReset, apply_plan, reset_interval
-from a2tg_jax.events import Change, EventInfo, Seen, read_probe
-from a2tg_jax.model import Model
+from a2tg_jax import (
+    Camera,
+    Change,
+    CloneSplitPrune,
+    EventInfo,
+    Gaussians,
+    Model,
+    OpacityReset,
+    Seen,
+    adam_init,
+    partition,
+)
+from a2tg_jax.core.gaussians import logit, rotation_matrices
+from a2tg_jax.densify.clone_split import CloneSplitPlan, apply_plan, reset_interval
+from a2tg_jax.events import read_probe
 
 NUM, LIVE, SCENE_SCALE = 60, 25, 2.0
 

@@ -9,21 +9,23 @@ import numpy as np
 import pytest
 
 from a2tg_jax import (
+    Appearance,
+    Bands,
     Change,
     DivergedError,
+    Gaussians2dMcmc,
     History,
     Interrupted,
+    Mcmc,
     StepEvent,
+    allocate_appearance,
     fit,
     init_from_points,
     load_checkpoint,
+    pytree,
     save_checkpoint,
     synthetic_scene,
 )
-from a2tg_jax.appearance import Appearance, Bands, allocate_appearance
-from a2tg_jax.core.pytree import pytree
-from a2tg_jax.mcmc import Mcmc
-from a2tg_jax.systems.baselines import Gaussians2dMcmc
 from a2tg_jax.training import step
 from a2tg_jax.training.batches import BatchOrder
 from a2tg_jax.training.divergence import _not_finite, largest_loss

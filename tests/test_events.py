@@ -13,8 +13,8 @@ from test_model_rows import NUM, rows_of, some_model
 from toy_system import Rings
 
 import a2tg_jax as a2tg
-from a2tg_jax.core.optim import adam_init
-from a2tg_jax.core.pytree import combine, num_compiled, partition
+from a2tg_jax import adam_init, combine, partition
+from a2tg_jax.core.pytree import num_compiled
 from a2tg_jax.training.cost import forecast_stages
 from a2tg_jax.training.reports import StageEffects
 from a2tg_jax.training.step import initial_state, jitted_step

@@ -21,7 +21,7 @@ from lab.stages import stages_of
 from run import experiments, interruptible, main, parse_arguments
 
 import a2tg_jax as a2tg
-from a2tg_jax.training import fit_stage
+from a2tg_jax import fit_stage
 
 
 @pytest.mark.long

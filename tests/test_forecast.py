@@ -14,14 +14,11 @@ import pytest
 from toy_system import Toy
 
 import a2tg_jax as a2tg
+from a2tg_jax import BilateralGrid, Corrections, Mcmc, Picture, Prune, resize_camera
 from a2tg_jax.cli import main as cli
 from a2tg_jax.cli.train import ask
-from a2tg_jax.core.cameras import resize_camera
-from a2tg_jax.data.photo_store import Picture
-from a2tg_jax.densify.pruning import Prune
 from a2tg_jax.host import machine, progress_bars
 from a2tg_jax.host.machine import allowed_memory
-from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.results.commands import quick_flags
 from a2tg_jax.results.forecast import (
     RunForecast,
@@ -34,10 +31,9 @@ from a2tg_jax.results.forecast import (
 from a2tg_jax.results.plan import plan_run
 from a2tg_jax.results.record import RunRecord, SceneSource
 from a2tg_jax.training import SYSTEMS, fitting, reports
-from a2tg_jax.training.corrections import BilateralGrid, sliced
+from a2tg_jax.training.corrections import sliced
 from a2tg_jax.training.cost import Bytes, check_rows_fit, forecast_stages, stage_bytes
 from a2tg_jax.training.loop import StageRun
-from a2tg_jax.training.options import Corrections
 from a2tg_jax.training.reports import Pace, RestOfRun
 from a2tg_jax.training.start import initial_model
 from a2tg_jax.training.step import StepSettings, jitted_step

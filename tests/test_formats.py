@@ -14,8 +14,15 @@ from small_values import some_gaussians
 
 from a2tg_jax import (
     A2tg,
+    Appearance,
+    Camera,
+    Exponents,
     Gaussians2d,
     Model,
+    Origin,
+    Similarity,
+    Texture,
+    allocate_appearance,
     init_from_points,
     load_model,
     load_ply,
@@ -26,11 +33,8 @@ from a2tg_jax import (
     synthetic_scene,
     transform_gaussians,
 )
-from a2tg_jax.appearance import Appearance, Exponents, MovableKernels, Texture, allocate_appearance, template_of
+from a2tg_jax.appearance import MovableKernels, template_of
 from a2tg_jax.cli.main import main
-from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.origin import Origin
-from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.io.archive import write_archive
 from a2tg_jax.io.formats import FORMATS, file_bytes, files_of, format_of, lost_by, unseen_elsewhere
 from a2tg_jax.io.model_file import number_in_file

@@ -9,7 +9,7 @@ import pytest
 from bits import bits_of
 
 import a2tg_jax as a2tg
-from a2tg_jax.training import Session, fit_stage
+from a2tg_jax import Session, fit_stage
 from a2tg_jax.training.loop import StageRun
 
 SCENE = a2tg.synthetic_scene(num_views=6, width=40, height=30, num_points=150)

@@ -23,19 +23,16 @@ from small_values import some_gaussians, some_world
 from test_data_colmap import write_scene as write_colmap
 
 import a2tg_jax as a2tg
-from a2tg_jax import appearance, mcmc
-from a2tg_jax.appearance import Appearance, Arguments, StaticShading, elementwise_functions, takes_arrays
+from a2tg_jax import Appearance, Checkpoint, Geometry, History, appearance, mcmc, pytree, render_appearance, static
+from a2tg_jax.appearance import Arguments, StaticShading, elementwise_functions, takes_arrays
 from a2tg_jax.cli import main as cli
-from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.data.load import SceneSource
 from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.rasterize.kernels import platforms
-from a2tg_jax.rasterize.render_types import Geometry
 from a2tg_jax.rasterize.views import render_traced
-from a2tg_jax.render import render_appearance
 from a2tg_jax.results import run_training
 from a2tg_jax.results.record import RunRecord, write_record
-from a2tg_jax.training import Checkpoint, History, corrections, losses, options
+from a2tg_jax.training import corrections, losses, options
 from a2tg_jax.training.checkpoint import check_resume
 from a2tg_jax.training.start import initial_model
 from a2tg_jax.training.terms import Photometric, l1

@@ -20,23 +20,29 @@ import numpy as np
 import pytest
 from run_folders import create_run, some_result
 
-from a2tg_jax import Change, StepEvent, fit
+from a2tg_jax import (
+    Change,
+    DivergedError,
+    Gaussians2dMcmc,
+    Mcmc,
+    StepEvent,
+    fit,
+    load_checkpoint,
+    load_model,
+    pytree,
+    save_checkpoint,
+)
 from a2tg_jax.cli import main as cli, runs
-from a2tg_jax.core.pytree import pytree
 from a2tg_jax.host import signals
 from a2tg_jax.host.atomic import replacing, write_whole
 from a2tg_jax.host.errors import error_text
 from a2tg_jax.host.machine import this_machine
 from a2tg_jax.host.regular_files import sha256_of
-from a2tg_jax.io.model_file import load_model
-from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.results import compression, forecast, run_evaluation, run_training
 from a2tg_jax.results.folder import OLD, RunFolder, old_run, opened, put_back_old, set_aside
 from a2tg_jax.results.output_paths import check_apart
 from a2tg_jax.results.record import RunRecord, SceneSource, read_record, read_run_file, write_record
 from a2tg_jax.results.run_training import MOST_RESTORED, RunOptions, train_run
-from a2tg_jax.systems.baselines import Gaussians2dMcmc
-from a2tg_jax.training import DivergedError, load_checkpoint, save_checkpoint
 from a2tg_jax.training.batches import BatchOrder
 from a2tg_jax.training.loop import StageRun
 

@@ -15,9 +15,9 @@ from PIL import Image
 from small_values import assert_same
 from test_data_transforms import write_points
 
-from a2tg_jax import Gaussians2dMcmc, Mcmc, fit, load_scene, synthetic_scene
+from a2tg_jax import Gaussians2dMcmc, Mcmc, Picture, fit, load_scene, synthetic_scene
 from a2tg_jax.data import photo_store as pictures
-from a2tg_jax.data.photo_store import Picture, Shelf
+from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.training import batches, loop
 from a2tg_jax.training.batches import Ahead, BatchOrder, PhotoStore
 

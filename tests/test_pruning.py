@@ -14,13 +14,8 @@ from test_splitting import some_state
 from test_view_dependence import banded
 
 import a2tg_jax as a2tg
-from a2tg_jax.core.optim import adam_init
-from a2tg_jax.core.pytree import partition
-from a2tg_jax.data.scene import View
-from a2tg_jax.densify.pruning import Prune, shown_in
-from a2tg_jax.densify.splitting import SplitByGradient
-from a2tg_jax.events import Due
-from a2tg_jax.model import Model
+from a2tg_jax import Due, Model, Prune, SplitByGradient, View, adam_init, partition
+from a2tg_jax.densify.pruning import shown_in
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.start import initial_model
 

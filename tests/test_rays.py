@@ -13,16 +13,13 @@ from PIL import Image
 from scenes_random import CAPACITY, as_camera, as_gaussians, as_textures, draw_scene, fisheye
 
 import a2tg_jax as a2tg
-from a2tg_jax.appearance import Appearance
-from a2tg_jax.core.cameras import Camera, looking
+from a2tg_jax import Appearance, Camera, Model, Prune, normal_consistency
+from a2tg_jax.core.cameras import looking
 from a2tg_jax.data.scene import kinds_of, ray_bytes
-from a2tg_jax.densify.pruning import Prune
-from a2tg_jax.model import Model
 from a2tg_jax.rasterize.views import pairs_of_view
 from a2tg_jax.training import batches
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.cost import fed_bytes
-from a2tg_jax.training.losses import normal_consistency
 
 WIDTH, HEIGHT = 43, 30
 BOTH = pytest.mark.parametrize("compositor", [pytest.param("xla", marks=pytest.mark.long), "native"])

@@ -9,10 +9,9 @@ import pytest
 from scenes_random import as_camera, as_gaussians, draw_scene
 
 import a2tg_jax as a2tg
-from a2tg_jax.core.cameras import Camera, crop_camera, resize_camera
-from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax import Camera, Gaussians, View, resize_camera
+from a2tg_jax.core.cameras import crop_camera
 from a2tg_jax.core.pytree import num_compiled
-from a2tg_jax.data.scene import View
 from a2tg_jax.render import jitted_render
 
 

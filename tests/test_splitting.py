@@ -11,20 +11,10 @@ from small_models import some_now
 from test_mcmc import random_gaussians
 
 import a2tg_jax as a2tg
+from a2tg_jax import AdamState, GradientStatistics, Model, Seen, SplitByGradient, Times, adam_init, partition
 from a2tg_jax.core.gaussians import rotation_matrices
-from a2tg_jax.core.optim import AdamState, adam_init
-from a2tg_jax.core.pytree import partition
-from a2tg_jax.densify.splitting import (
-    SplitByGradient,
-    SplitStatistics,
-    draw_distinct_hosts,
-    draw_weights,
-    logits_of_halves,
-    split_rows,
-)
-from a2tg_jax.events import GradientStatistics, Seen, Times
+from a2tg_jax.densify.splitting import SplitStatistics, draw_distinct_hosts, draw_weights, logits_of_halves, split_rows
 from a2tg_jax.mcmc import plan_growth, plan_relocation
-from a2tg_jax.model import Model
 
 NUM, LIVE = 400, 300
 KEY = jax.random.key(0)

@@ -13,10 +13,9 @@ from small_models import some_model
 from toy_system import Toy
 
 import a2tg_jax as a2tg
-from a2tg_jax.core.optim import adam_init
-from a2tg_jax.core.pytree import combine, num_compiled, partition
+from a2tg_jax import adam_init, combine, fit_stage, partition
+from a2tg_jax.core.pytree import num_compiled
 from a2tg_jax.io.config_json import changed_config
-from a2tg_jax.training import fit_stage
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.options import own_options

@@ -14,27 +14,36 @@ from small_models import with_row
 
 from a2tg_jax import (
     A2tg,
+    Appearance,
     Change,
     Checkpoint,
+    CloneSplitPrune,
+    Gaussians2d,
+    Gaussians2dMcmc,
     Interrupted,
+    LossConfig,
+    Mcmc,
     RenderSettings,
+    Session,
+    Stage,
     StepEvent,
     Term,
+    Texture,
+    Upscale,
+    allocate_appearance,
     fit,
+    fit_stage,
+    like,
     load_checkpoint,
+    pytree,
     save_checkpoint,
     ssim,
     synthetic_scene,
     view_image,
 )
-from a2tg_jax.adapt import Upscale
-from a2tg_jax.appearance import Appearance, Texture, allocate_appearance
-from a2tg_jax.core.pytree import num_compiled, pytree
+from a2tg_jax.core.pytree import num_compiled
 from a2tg_jax.core.table import Shape
-from a2tg_jax.densify.clone_split import CloneSplitPrune
-from a2tg_jax.mcmc import Mcmc
-from a2tg_jax.systems.baselines import Gaussians2d, Gaussians2dMcmc
-from a2tg_jax.training import LossConfig, Session, Stage, fit_stage, like, loop
+from a2tg_jax.training import loop
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.start import initial_model, padded
 from a2tg_jax.training.step import jitted_step
