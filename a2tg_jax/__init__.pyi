@@ -61,7 +61,6 @@ from .events import (
     Now as Now,
     Seen as Seen,
     StepEvent as StepEvent,
-    Times as Times,
     keep_rows as keep_rows,
 )
 from .finish.compaction import (

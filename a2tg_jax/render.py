@@ -127,7 +127,7 @@ def render_appearance(
 
 @functools.cache
 def jitted_render() -> Callable[..., tuple[RenderOutput, Array]]:
-    """Return `render_traced` under jit; its cache counts the compilations."""
+    """Return `render_traced` under jit."""
     # Made at the first call: importing this library calls no `jax.jit`.
     return jax.jit(render_traced, static_argnums=(4,), static_argnames=("has_geometry",))
 

@@ -174,7 +174,7 @@ def assert_divided(state):
 class Reverse(HostEvent):
     """A custom event that reverses the order of the rows, by JAX and by NumPy."""
 
-    def iterations(self, num_iterations):
+    def times(self, num_iterations):
         return (2,)
 
     def apply(self, due, model, moments, state):

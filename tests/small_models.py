@@ -46,12 +46,12 @@ def some_checkpoint(system):
     return Checkpoint(system, len(stages) - 1, initial_state(stages[-1], live), history)
 
 
-def some_now(iteration, num_iterations, times=None, *, num_keys=1, scene_scale=1.0):
+def some_now(iteration, num_iterations, num_left=None, *, num_keys=1, scene_scale=1.0):
     """What an event inside the step is given."""
     numbers = (jnp.asarray(number, jnp.int32) for number in (iteration, num_iterations))
     keys = jax.random.split(jax.random.key(0), num_keys)
     done, length = numbers
-    return Now(keys, done, jnp.float32(1e-4), length, jnp.float32(scene_scale), times)
+    return Now(keys, done, jnp.float32(1e-4), length, jnp.float32(scene_scale), num_left)
 
 
 def write_random_squeeze(path):

@@ -331,7 +331,7 @@ def test_padding_is_neutral_and_has_no_moments():
     ],
 )
 def test_impossible_choices_are_refused_before_training(event, message):
-    assert Upscale(at=(0.1, 0.2, 0.9)).iterations(3) == (1, 3), "upscalings that fall together are one"
+    assert Upscale(at=(0.1, 0.2, 0.9)).times(3) == (1, 3), "upscalings that fall together are one"
     stage = A2tg.preset("smoke").stages()[1]
     with pytest.raises(ValueError, match=message):
         dataclasses.replace(stage, events=(event,)).check()

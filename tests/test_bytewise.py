@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled_programs import compiled_programs
 from small_values import some_gaussians
 
 import a2tg_jax as a2tg
@@ -26,7 +27,6 @@ from a2tg_jax import (
 from a2tg_jax.appearance.files import arrays_of
 from a2tg_jax.appearance.parts import log_exponents_of
 from a2tg_jax.core.budget import bytes_of, event_budget
-from a2tg_jax.core.pytree import num_compiled
 from a2tg_jax.io.config_json import changed_config
 from a2tg_jax.results.record import compared_system
 from a2tg_jax.training.start import initial_model, padded
@@ -92,10 +92,10 @@ def test_details_have_their_room_before_they_come(scene, before_details, monkeyp
     system, first = before_details
 
     def details():
-        before = num_compiled(jitted_step())
-        result = a2tg.fit_stage(scene, system, 1, first, progress=False)
+        with compiled_programs("train_step") as programs:
+            result = a2tg.fit_stage(scene, system, 1, first, progress=False)
         assert result.history.megabytes.max() <= 0.04
-        return result.model, num_compiled(jitted_step()) - before - result.num_regrown
+        return result.model, len(programs) - result.num_regrown
 
     jitted_step().clear_cache()
     model, num_steps = details()
@@ -123,9 +123,9 @@ def test_a_resumed_stage_has_its_room_again(scene, before_details, tmp_path):
 
     whole = a2tg.fit_stage(scene, system, 1, first, progress=False, on_checkpoint=keep, checkpoint_every=4)
     for stop in stops[:2]:
-        before = num_compiled(jitted_step())
-        rest = a2tg.fit_stage(scene, system, 1, resume=stop, progress=False)
-        assert num_compiled(jitted_step()) - before - rest.num_regrown <= 1, stop.iteration
+        with compiled_programs("train_step") as programs:
+            rest = a2tg.fit_stage(scene, system, 1, resume=stop, progress=False)
+        assert len(programs) - rest.num_regrown <= 1, stop.iteration
         assert_same(rest.model, whole.model)
 
 

@@ -103,7 +103,7 @@ def test_parameters_that_nothing_but_adam_changed_are_not_checked_again(scene, m
     settings, stage, _, _, *others = run.arguments(1)
     settings = dataclasses.replace(settings, due=(True,))
     stage, state = dataclasses.replace(stage, events=(Brighten(),)), dataclasses.replace(run.state, events=(None,))
-    jax.eval_shape(lambda state: step.attempt(settings, stage, stage.clock(), state, *others), state)
+    jax.eval_shape(lambda state: step.attempt(settings, stage, stage.clock(1), state, *others), state)
     assert sizes == [1 + 5 * 60 + 60], "the loss, five gradients and the colours"
 
 

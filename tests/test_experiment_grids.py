@@ -437,7 +437,7 @@ def test_placed_methods_have_the_weight_and_the_new_gaussians_of_bytewise():
     for system in placed:
         first, last = system.stages()
         place = first.events[-1]
-        assert isinstance(place, a2tg.PlaceByError) and place.iterations(first.iterations)
+        assert isinstance(place, a2tg.PlaceByError) and place.times(first.iterations)
         assert place.cap == int(0.3e6) // (4 * {0: 13, 1: 22}[system.sh_degree])
         weights = [
             [term.weight for term in stage.losses if getattr(term, "name", "") == "opacity"] for stage in (first, last)

@@ -36,7 +36,7 @@ from a2tg_jax.training.cost import Bytes, check_rows_fit, forecast_stages, stage
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.reports import Pace, RestOfRun
 from a2tg_jax.training.start import initial_model
-from a2tg_jax.training.step import StepSettings, jitted_step
+from a2tg_jax.training.step import jitted_step
 
 MB = 10**6
 
@@ -83,10 +83,7 @@ def test_a_step_needs_what_xla_says(width, height, num):
     scene = dataclasses.replace(scene_of(width, height), points=points, colors=np.full_like(points, 0.5))
     system = a2tg.Gaussians2dMcmc(stage1_iterations=4, densify=a2tg.Mcmc(cap=num))
     run = StageRun(scene, system, 0, initial_model(scene, system))
-    photographs, views = run.photographs.batch(1)
-    settings = StepSettings(run.render_settings((height, width)), system.background)
-    args = (settings, run.stage, run.clock, run.state, photographs, views, run.scene_scale, run.key)
-    lowered = jitted_step().lower(*args)
+    lowered = jitted_step().lower(*run.arguments(1))
     said = lowered.compile().memory_analysis()
     expected = stage_bytes(scene, system, run.stage, num, run.model.num_bytes)
     step = expected.gradients + expected.pixels

@@ -552,9 +552,9 @@ CALLS = {
     "staged(events=(Noise(), Noise))": "stage 'own' … events[1] … StepEvent or a HostEvent … the class Noise",
     "staged(events=(Undecorated(),))": "stage 'own' … events[0] … pytree … Undecorated",
     "staged(events=(Named(),))": "stage 'own' … events[0] … numbers … 'a' … Named",
-    "staged(events=(made(HostEvent, iterations=lambda self, num: (0.5,)),))": "Mine.iterations … ascending … (0.5,)",
-    "staged(events=(made(HostEvent, iterations=lambda self, num: range(1, num, 0)),))": "Mine.iterations … zero",
-    "staged(events=(made(StepEvent, times=lambda self, num: Times(1, num, 0)),))": "Mine.times … every … at least 1",
+    "staged(events=(made(HostEvent, times=lambda self, num: (0.5,)),))": "Mine.times … ascending … (0.5,)",
+    "staged(events=(made(HostEvent, times=lambda self, num: range(1, num, 0)),))": "Mine.times … zero",
+    "staged(events=(made(StepEvent, times=lambda self, num: range(num, 0, -1)),))": "Mine.times … ascending … range(",
     "staged(losses=roughness)": "stage 'own' … losses … tuple or a list … function",
     "staged(losses=())": "stage 'own' … losses",
     "staged(losses=(roughness,))": "stage 'own' … losses[0] … loss term … function … Term(roughness)",
@@ -571,10 +571,10 @@ CALLS = {
     "trained(events=(made(StepEvent, observes=True, observe=lambda self, state, model, seen: seen.colors),))": (
         "Mine.observe … structure"
     ),
-    "trained(events=(made(HostEvent, iterations=lambda self, num: (1,), apply=lambda self, due, *result: result),))": (
+    "trained(events=(made(HostEvent, times=lambda self, num: (1,), apply=lambda self, due, *result: result),))": (
         "stage 'own' … Mine.apply … Change … tuple"
     ),
-    "trained(events=(made(HostEvent, iterations=lambda self, num: (1,), apply=nothing_left),))": (
+    "trained(events=(made(HostEvent, times=lambda self, num: (1,), apply=nothing_left),))": (
         "Mine.apply … is_kept … at least 2 … 0 of 50"
     ),
     "TextureOptions(extent=0)": "extent must be at least 0.001 and at most 1000; got 0",

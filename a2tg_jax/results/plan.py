@@ -125,7 +125,7 @@ def common_options(system: System) -> list[Any]:
 def is_equal(a: Stage, b: Stage) -> bool:
     """Return whether two stages are equal in everything, arrays and classes included."""
     # jax.tree compares classes and static fields; arrays are leaves, which == does not reduce to one bool.
-    if jax.tree.structure(a) != jax.tree.structure(b):  # type: ignore[operator]
+    if a.name != b.name or jax.tree.structure(a) != jax.tree.structure(b):  # type: ignore[operator]
         return False
     pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
     return all(np.array_equal(np.asarray(x), np.asarray(y)) for x, y in pairs)

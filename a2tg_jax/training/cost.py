@@ -144,7 +144,7 @@ def forecast_stages(
         on_host = [event for event in stage.events if isinstance(event, HostEvent)]
         programs = 1 + sum(event.num_programs(stage.iterations) for event in on_host)
         # An event has the old state and the new one; later, the devices get their shares.
-        is_changed = any(event.iterations(stage.iterations) for event in on_host)
+        is_changed = any(event.times(stage.iterations) for event in on_host)
         whole = STATES * (2 if is_changed else 1 + 1 / num_devices) * model_bytes
         seconds = stage.iterations * system.batch_size * (SECONDS_PER_ROW * num + SECONDS_PER_PIXEL * mean_pixels)
         needed = stage_bytes(scene, system, stage, num, model_bytes, num_devices)
@@ -196,7 +196,7 @@ def stage_bytes(
 
     Each of several devices has its share of the state, and, while it draws its views, a copy of the model.
     """
-    is_changed = any(isinstance(event, HostEvent) and event.iterations(stage.iterations) for event in stage.events)
+    is_changed = any(isinstance(event, HostEvent) and event.times(stage.iterations) for event in stage.events)
     largest = largest_view(scene.train)
     batch = system.batch_size // num_devices
     per_view = sum(BYTES_PER_FLOAT * correction.neutral.size for correction in stage.corrections)

@@ -16,11 +16,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from a2tg_jax.core.compilations import compilations
 from a2tg_jax.core.numerics import evenly_chosen
-from a2tg_jax.core.pytree import num_compiled
 from a2tg_jax.core.table import Shape
 from a2tg_jax.data.scene import Scene
-from a2tg_jax.events import Change, Due, HostEvent, StepEvent
+from a2tg_jax.events import Change, Due, Event, HostEvent, StepEvent
 from a2tg_jax.host.machine import Devices
 from a2tg_jax.model import Model
 from a2tg_jax.parallel import any_process, check_batch_size, divided, everywhere, mesh_of, num_processes, whole
@@ -121,12 +121,12 @@ class Session:
         self.shapes: set[Shape] = set()
         """Shapes of textures."""
         self.capacities: dict[Hashable, set[int]] = {}
-        """Capacities of tile lists, by stage and image size."""
+        """Capacities of tile lists, by appearance, number of rows and image size."""
 
     def capacity(self, place: Hashable, needed: int) -> int:
         """Return the largest known capacity up to twice the pairs that are needed, or else a new one.
 
-        Capacities are kept by place, a stage and an image size.
+        Capacities are kept by place: an appearance, a number of rows and an image size.
         """
         capacities = self.capacities.setdefault(place, set())
         # Few different capacities, at most half as large again as needed.
@@ -202,7 +202,7 @@ class StageRun:
                 state = continued_state(stages[index - 1], self.stage, state)
         self.state = divided(self.mesh, self._with_room(state))
 
-        self.clock = self.stage.clock()._replace(largest_loss=largest_loss(self.history))
+        self.largest_loss = largest_loss(self.history)
         self.scene_scale = jnp.asarray(scene.scale, self.state.model.gaussians.means.dtype)
         self.key = jax.random.fold_in(jax.random.key(system.seed), index + 1)
         self.order = BatchOrder(self.views, system.batch_size, system.seed * 2 + index + 1, self.num_restored)
@@ -334,7 +334,7 @@ class StageRun:
             on_log(self._rows[-1])
         # The first logged loss decides which later one is an explosion.
         if len(self._rows) == 1:
-            self.clock = self.clock._replace(largest_loss=largest_loss(self.history))
+            self.largest_loss = largest_loss(self.history)
 
     # Steps
 
@@ -353,14 +353,15 @@ class StageRun:
 
     def _launch(self, iteration: int) -> StepInfo:
         arguments = self.arguments(iteration)
-        step = jitted_step()
-        num_programs = num_compiled(step)
         started = time.perf_counter()
         info: StepInfo
-        self.state, info = step(*arguments)
-        is_compiled = num_compiled(step) > num_programs
-        self.effects.launch(iteration, time.perf_counter() - started if is_compiled else None)
-        if is_compiled:
+        with compilations() as programs:
+            try:
+                self.state, info = jitted_step()(*arguments)
+            except ValueError as error:  # The step is not compiled for the name of its stage.
+                raise ValueError(f"stage {self.stage.name!r}: {error}") from error
+        self.effects.launch(iteration, time.perf_counter() - started if programs else None)
+        if programs:
             self.num_compiled += 1
             self.session.after_compiling()
         return info
@@ -369,13 +370,14 @@ class StageRun:
         """Return the arguments of the step of an iteration."""
         photographs, views = self.photographs.batch(iteration)
         render = self.render_settings(self._size(iteration))
+        clock = self.stage.clock(iteration, self.largest_loss)
         due = None
         if are_events_decided_by_host(self.state):
-            due = tuple(times is None or bool(times.is_due(iteration)) for times in self.clock.times)
+            due = tuple(left is None or left > 0 for left in clock.num_left)
         settings = StepSettings(render, self.system.background, due, self.mesh)
         rows = np.asarray(self.order.indices(iteration), np.int32) if self.stage.corrections else None
         rows = everywhere(self.mesh, rows)
-        return settings, self.stage, self.clock, self.state, photographs, views, self.scene_scale, self.key, rows
+        return settings, self.stage, clock, self.state, photographs, views, self.scene_scale, self.key, rows
 
     def _size(self, iteration: int) -> Size:
         return self.views[self.order.indices(iteration)[0]].picture.size
@@ -400,7 +402,7 @@ class StageRun:
 
     def _capacity(self, size: Size, pairs: float) -> int:
         """Return a capacity for a number of pairs in views of a size, if possible one of the session's."""
-        stage = self.stage.name, self.stage.appearance, self.state.model.gaussians.num
+        stage = self.stage.appearance, self.state.model.gaussians.num
         return self.session.capacity((*stage, *size), capacity_for(int(pairs)))
 
     def _mend(self, iteration: int, info: StepInfo) -> None:
@@ -434,18 +436,18 @@ class StageRun:
 
     def _due_on_host(self) -> list[int]:
         """Return the iterations of all host events, and the last one of each step event whose statistic is dropped."""
-        count = self.stage.iterations
         due: list[int] = []
-        for event, times in zip(self.stage.events, self.clock.times, strict=True):
+        for event, times in zip(self.stage.events, self.stage.times, strict=True):
             if isinstance(event, HostEvent):
-                due += event.iterations(count)
-            elif times is not None and event.observes and self._is_worth_dropping(times.last):
-                due.append(times.last)
+                due += times
+            elif times and self._is_dropped_after(event, times[-1]):
+                due.append(times[-1])
         return due
 
-    def _is_worth_dropping(self, iteration: int) -> bool:
-        """Return whether enough iterations are left to compile a step without the statistics that nothing reads."""
-        return self.stage.iterations - iteration >= WORTH_COMPILING
+    def _is_dropped_after(self, event: Event, last: int) -> bool:
+        """Return whether what an event gathers is dropped after its last time: if enough iterations are left to compile
+        a step without the statistics that nothing reads."""
+        return event.observes and self.stage.iterations - last >= WORTH_COMPILING
 
     def _host_events(self, iteration: int) -> None:
         """Apply the host events that follow an iteration, and drop the statistics of past events."""
@@ -453,30 +455,29 @@ class StageRun:
             return
         if self.mesh is not None:
             self.state = jax.device_put(self.whole_state)
-        for place, (event, times) in enumerate(zip(self.stage.events, self.clock.times, strict=True)):
-            if not isinstance(event, HostEvent):
-                if times is not None and event.observes and iteration == times.last:
-                    self._keep(place, None)
+        for place, (event, times) in enumerate(zip(self.stage.events, self.stage.times, strict=True)):
+            if iteration not in times:
                 continue
-            due = event.iterations(self.stage.iterations)
-            if iteration not in due:
-                continue
-            background = BACKGROUNDS[self.system.background]
-            time_due = Due(
-                due.index(iteration) + 1, len(due), self.views, background=background, shapes=self.session.shapes
-            )
-            with calling(event, "apply", self.stage.name):
-                change = event.apply(time_due, self.state.model, self.state.moments, self.state.events[place])
-                change = checked_change(change)
-            self.effects.apply(place, self.state, change)
-            self.state = dataclasses.replace(self.state, model=change.model, moments=change.moments)
-            if change.rows is not None:  # Statistics of other events move along with the Gaussians.
-                pairs = zip(self.stage.events, self.state.events, strict=True)
-                states = (None if state is None else other.gather(state, change.rows) for other, state in pairs)
-                self.state = dataclasses.replace(self.state, events=tuple(states))
-            is_dropped = iteration == due[-1] and event.observes and self._is_worth_dropping(iteration)
-            self._keep(place, None if is_dropped else change.state)
+            if isinstance(event, HostEvent):
+                self._apply(place, event, times.index(iteration) + 1, len(times))
+            if iteration == times[-1] and self._is_dropped_after(event, iteration):
+                self._keep(place, None)
         self.state = divided(self.mesh, self.state)
+
+    def _apply(self, place: int, event: HostEvent, index: int, count: int) -> None:
+        """Apply the event at a place, for the `index`-th of `count` times."""
+        background = BACKGROUNDS[self.system.background]
+        due = Due(index, count, self.views, background=background, shapes=self.session.shapes)
+        with calling(event, "apply", self.stage.name):
+            change = event.apply(due, self.state.model, self.state.moments, self.state.events[place])
+            change = checked_change(change)
+        self.effects.apply(place, self.state, change)
+        self.state = dataclasses.replace(self.state, model=change.model, moments=change.moments)
+        if change.rows is not None:  # Statistics of other events move along with the Gaussians.
+            pairs = zip(self.stage.events, self.state.events, strict=True)
+            states = (None if state is None else other.gather(state, change.rows) for other, state in pairs)
+            self.state = dataclasses.replace(self.state, events=tuple(states))
+        self._keep(place, change.state)
 
     def _keep(self, place: int, state: object) -> None:
         """Replace the state of the event at a place."""

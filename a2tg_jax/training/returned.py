@@ -21,12 +21,13 @@ from a2tg_jax.model import Model
 
 
 @contextlib.contextmanager
-def calling(event: Event, method: str, stage_name: str) -> Iterator[None]:
-    """Name the stage, the event and its method in errors of the block, which calls the method."""
+def calling(event: Event, method: str, stage_name: str | None = None) -> Iterator[None]:
+    """Name the event and its method in errors of the block, which calls the method, and the stage if it is given."""
     try:
         yield
     except (ValueError, ArithmeticError) as error:
-        raise ValueError(f"stage {stage_name!r}: {type(event).__name__}.{method}: {error}") from error
+        where = "" if stage_name is None else f"stage {stage_name!r}: "
+        raise ValueError(f"{where}{type(event).__name__}.{method}: {error}") from error
 
 
 def check_scalar(name: str, value: object) -> None:
