@@ -17,6 +17,7 @@ from jax import Array
 from jax.typing import DTypeLike
 
 from a2tg_jax.appearance.base import clear_rows
+from a2tg_jax.base.text import shortened
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_floats, check_mask, check_shape
 from a2tg_jax.core.named_fields import NamedFields
@@ -25,10 +26,9 @@ from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.origin import BLACK, Color
 from a2tg_jax.core.pytree import combine, partition, pytree
 from a2tg_jax.core.table import Shape, map_rows, rows_moved
-from a2tg_jax.data.scene import View
-from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.pixel import Statistic as Statistic
+from a2tg_jax.scene import View
 
 LEAST_LEFT = 2
 """Smallest number of Gaussians that training needs."""

@@ -19,7 +19,7 @@ from test_shared import Own
 
 import a2tg_jax as a2tg
 from a2tg_jax import Change, Gaussians2dMcmc, HostEvent, Session, SplitByGradient, StepEvent, fit_stage
-from a2tg_jax.io.config_json import changed_config
+from a2tg_jax.core.config_json import changed_config
 from a2tg_jax.parallel import whole
 from a2tg_jax.training import loop
 from a2tg_jax.training.batches import PhotoStore

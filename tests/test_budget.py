@@ -28,8 +28,8 @@ from a2tg_jax import (
 )
 from a2tg_jax.cli import main as cli
 from a2tg_jax.core.budget import bytes_per_gaussian, megabytes_of, number_to_reach
+from a2tg_jax.core.config_json import changed_config, config_from_dict, config_to_dict
 from a2tg_jax.core.gaussians import logit
-from a2tg_jax.io.config_json import changed_config, config_from_dict, config_to_dict
 from a2tg_jax.training.fitting import warn_of_budget
 from a2tg_jax.training.registry import SYSTEMS, system_from_dict, system_to_dict
 from a2tg_jax.training.start import check_start

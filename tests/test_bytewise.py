@@ -27,7 +27,7 @@ from a2tg_jax import (
 from a2tg_jax.appearance.files import arrays_of
 from a2tg_jax.appearance.parts import log_exponents_of
 from a2tg_jax.core.budget import bytes_of, event_budget
-from a2tg_jax.io.config_json import changed_config
+from a2tg_jax.core.config_json import changed_config
 from a2tg_jax.results.record import compared_system
 from a2tg_jax.training.start import initial_model, padded
 from a2tg_jax.training.step import jitted_step

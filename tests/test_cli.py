@@ -20,12 +20,11 @@ from PIL import Image
 from run_folders import create_run
 
 from a2tg_jax import find_system, load_model, load_ply, save_model
+from a2tg_jax.base.regular_files import sha256_of
 from a2tg_jax.cli import doctor, main as cli
 from a2tg_jax.cli.train import Train, train_defaults
 from a2tg_jax.data.load import SceneSource
-from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.host import startup
-from a2tg_jax.host.regular_files import sha256_of
 from a2tg_jax.io.compact import unframed
 from a2tg_jax.results import finishing, run_training, viewing
 from a2tg_jax.results.folder import RunFolder
@@ -34,6 +33,7 @@ from a2tg_jax.results.history import read_history
 from a2tg_jax.results.model_source import open_source
 from a2tg_jax.results.record import read_record, write_record
 from a2tg_jax.results.viewing import routes_of
+from a2tg_jax.scene import origin_of_scene
 from a2tg_jax.training import SYSTEMS
 
 TINY = [

@@ -21,13 +21,13 @@ from a2tg_jax import (
     smallest_within,
     synthetic_scene,
 )
+from a2tg_jax.base.text import in_bytes
 from a2tg_jax.cli import main as cli
-from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.finish import compaction
 from a2tg_jax.finish.compaction import best_within, try_choices
-from a2tg_jax.host.text import in_bytes
 from a2tg_jax.io.compact import encode_model
 from a2tg_jax.results import compression
+from a2tg_jax.scene import origin_of_scene
 
 SCENE = synthetic_scene(num_views=6, width=24, height=18, num_points=300)
 SMALL = {"means": (4, 8, 16), "opacities": (2, 10), "sh_0": (3, 8), "sh_rest": (3, 8), "texels": (3, 8)}

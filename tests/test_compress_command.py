@@ -25,12 +25,12 @@ from a2tg_jax import (
 )
 from a2tg_jax.cli import main as cli
 from a2tg_jax.data.load import SceneSource
-from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.finish import tuning
 from a2tg_jax.io.compact import grids_of, half_turned
 from a2tg_jax.results import compression
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.record import RunRecord, read_record, write_record
+from a2tg_jax.scene import origin_of_scene
 from a2tg_jax.training import reports
 from a2tg_jax.training.start import initial_model
 

@@ -15,10 +15,11 @@ from toy_system import Toy
 
 import a2tg_jax as a2tg
 from a2tg_jax import BilateralGrid, Corrections, Mcmc, Picture, Prune, resize_camera
+from a2tg_jax.base import machine
+from a2tg_jax.base.machine import allowed_memory
 from a2tg_jax.cli import main as cli
 from a2tg_jax.cli.train import ask
-from a2tg_jax.host import machine, progress_bars
-from a2tg_jax.host.machine import allowed_memory
+from a2tg_jax.host import progress_bars
 from a2tg_jax.results.commands import quick_flags
 from a2tg_jax.results.forecast import (
     RunForecast,

@@ -31,13 +31,13 @@ from a2tg_jax import (
     save_model,
     save_ply,
 )
+from a2tg_jax.base.archive import FORMAT as CHECKPOINT, read_archive, write_archive
+from a2tg_jax.base.json_text import parse_json
+from a2tg_jax.base.npz import read_npz
 from a2tg_jax.core.table import check_places
-from a2tg_jax.host.json_text import parse_json
-from a2tg_jax.host.npz import read_npz
 from a2tg_jax.io import ply
-from a2tg_jax.io.archive import FORMAT as CHECKPOINT, read_archive, write_archive
-from a2tg_jax.io.model_file import FORMAT as MODEL
-from a2tg_jax.io.validate import check_model
+from a2tg_jax.model import check_model
+from a2tg_jax.model_file import FORMAT as MODEL
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.texture import check_textures
 from a2tg_jax.training.registry import system_from_dict

@@ -10,8 +10,8 @@ from hostile_files import put
 from run_folders import create_run
 
 from a2tg_jax import History
+from a2tg_jax.base.json_text import DEEPEST, parse_json, parse_toml, read_json
 from a2tg_jax.cli import main as cli
-from a2tg_jax.host.json_text import DEEPEST, parse_json, parse_toml, read_json
 from a2tg_jax.results.figures import curves_figure
 from a2tg_jax.results.folder import MOST_NAMES, RunFolder, open_run
 from a2tg_jax.results.history import NAMES, read_history, write_history

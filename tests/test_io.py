@@ -25,10 +25,10 @@ from a2tg_jax import (
     transform_gaussians,
 )
 from a2tg_jax.appearance import Billboards, MovableKernels
+from a2tg_jax.base.archive import read_archive, read_archive_header, write_archive
+from a2tg_jax.core.config_json import config_from_dict, config_to_dict, flatten_config
 from a2tg_jax.core.sh import sh_basis
 from a2tg_jax.core.similarity import sh_rotation
-from a2tg_jax.io.archive import read_archive, read_archive_header, write_archive
-from a2tg_jax.io.config_json import config_from_dict, config_to_dict, flatten_config
 from a2tg_jax.io.ply import ATTRIBUTES, encode_ply
 
 

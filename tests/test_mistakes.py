@@ -27,11 +27,11 @@ from a2tg_jax import Appearance, Checkpoint, Geometry, History, appearance, mcmc
 from a2tg_jax.appearance import Arguments, StaticShading, elementwise_functions, takes_arrays
 from a2tg_jax.cli import main as cli
 from a2tg_jax.data.load import SceneSource
-from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.rasterize.kernels import platforms
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.results import run_training
 from a2tg_jax.results.record import RunRecord, write_record
+from a2tg_jax.scene import origin_of_scene
 from a2tg_jax.training import corrections, losses, options
 from a2tg_jax.training.checkpoint import check_resume
 from a2tg_jax.training.start import initial_model

@@ -34,8 +34,8 @@ from a2tg_jax import (
     to_gsplat,
 )
 from a2tg_jax.appearance import template_of
-from a2tg_jax.io.archive import read_archive, read_archive_header, write_archive
-from a2tg_jax.io.model_file import FORMAT
+from a2tg_jax.base.archive import read_archive, read_archive_header, write_archive
+from a2tg_jax.model_file import FORMAT
 
 SIZES = [(1, 1), (4, 2), (1, 4), (2, 2), (4, 2), (1, 1), (3, 5)]
 

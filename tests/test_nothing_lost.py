@@ -32,12 +32,12 @@ from a2tg_jax import (
     pytree,
     save_checkpoint,
 )
+from a2tg_jax.base.atomic import replacing, write_whole
+from a2tg_jax.base.machine import this_machine
+from a2tg_jax.base.regular_files import sha256_of
 from a2tg_jax.cli import main as cli, runs
 from a2tg_jax.host import signals
-from a2tg_jax.host.atomic import replacing, write_whole
 from a2tg_jax.host.errors import error_text
-from a2tg_jax.host.machine import this_machine
-from a2tg_jax.host.regular_files import sha256_of
 from a2tg_jax.results import compression, forecast, run_evaluation, run_training
 from a2tg_jax.results.folder import OLD, RunFolder, old_run, opened, put_back_old, set_aside
 from a2tg_jax.results.output_paths import check_apart
@@ -209,7 +209,7 @@ def test_the_error_of_a_full_disk_names_the_file(tmp_path, monkeypatch, capsys, 
 def test_a_second_process_is_refused_and_a_killed_one_holds_nothing(tmp_path, capsys):
     run = filled(tmp_path / "run")
     lock = (
-        "import sys\nfrom a2tg_jax.host.operating_system import try_lock\n"
+        "import sys\nfrom a2tg_jax.base.operating_system import try_lock\n"
         "file = open(sys.argv[1], 'a')\nprint(try_lock(file.fileno()), flush=True)\ninput()"
     )
     command = [sys.executable, "-c", lock, str(run.marker)]

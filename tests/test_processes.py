@@ -13,11 +13,11 @@ from run_folders import create_run
 
 import a2tg_jax as a2tg
 from a2tg_jax import Session, fit_stage, load_model
+from a2tg_jax.base.archive import write_archive
+from a2tg_jax.base.machine import Devices
 from a2tg_jax.cli import main as cli
 from a2tg_jax.cli.processes import LOST, is_lost
 from a2tg_jax.cli.train import train_defaults
-from a2tg_jax.host.machine import Devices
-from a2tg_jax.io.archive import write_archive
 from a2tg_jax.results import run_processes
 from a2tg_jax.results.commands import resuming_command
 from a2tg_jax.results.folder import RunFolder

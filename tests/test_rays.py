@@ -15,8 +15,8 @@ from scenes_random import CAPACITY, as_camera, as_gaussians, as_textures, draw_s
 import a2tg_jax as a2tg
 from a2tg_jax import Appearance, Camera, Model, Prune, normal_consistency
 from a2tg_jax.core.cameras import looking
-from a2tg_jax.data.scene import kinds_of, ray_bytes
 from a2tg_jax.rasterize.views import pairs_of_view
+from a2tg_jax.scene import kinds_of, ray_bytes
 from a2tg_jax.training import batches
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.cost import fed_bytes

@@ -42,9 +42,8 @@ from a2tg_jax import (
     view_image,
 )
 from a2tg_jax.appearance import MovableKernels
+from a2tg_jax.base.text import in_bytes
 from a2tg_jax.cli import main as cli, runs
-from a2tg_jax.data.scene import origin_of_scene
-from a2tg_jax.host.text import in_bytes
 from a2tg_jax.measure import evaluation
 from a2tg_jax.results.commands import repeating_command
 from a2tg_jax.results.folder import OLD, RunFolder, check_free, drop_old, open_run, set_aside
@@ -65,6 +64,7 @@ from a2tg_jax.results.report import (
 )
 from a2tg_jax.results.run_evaluation import check_held_out, evaluate_run
 from a2tg_jax.results.run_training import RunOptions, train_run
+from a2tg_jax.scene import origin_of_scene
 
 needs_tensorboard = pytest.mark.skipif(
     importlib.util.find_spec("tensorboardX") is None, reason="the extra [tensorboard] is not installed"

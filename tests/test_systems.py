@@ -15,7 +15,7 @@ from toy_system import Toy
 
 import a2tg_jax as a2tg
 from a2tg_jax import adam_init, combine, fit_stage, partition
-from a2tg_jax.io.config_json import changed_config
+from a2tg_jax.core.config_json import changed_config
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.options import own_options

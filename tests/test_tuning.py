@@ -28,7 +28,6 @@ from a2tg_jax import (
 )
 from a2tg_jax.appearance import files
 from a2tg_jax.core.cameras import moved_viewmat
-from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.finish import tuning
 from a2tg_jax.finish.compaction import TooLargeError
 from a2tg_jax.finish.tuning import (
@@ -43,6 +42,7 @@ from a2tg_jax.finish.tuning import (
 )
 from a2tg_jax.io.compact import GROUPS, decode_model, encode_model, grids_of, half_turned
 from a2tg_jax.results.run_evaluation import refined_views
+from a2tg_jax.scene import origin_of_scene
 from a2tg_jax.training.corrections import exposed
 
 COARSE = CompactChoices(

@@ -36,11 +36,11 @@ from a2tg_jax import (
 )
 from a2tg_jax.appearance import Billboards, MovableKernels, template_of
 from a2tg_jax.appearance.parts import bands_of_dense, dense_bands, empty_bands, floats_of_band, sizes_of_degrees
+from a2tg_jax.base.archive import read_archive, write_archive
 from a2tg_jax.core.budget import within_budget
 from a2tg_jax.core.table import Shape, bucket_capacity, resize
 from a2tg_jax.densify.view_dependence import ViewDependence, most_blocks, raised_degrees, without_idle
-from a2tg_jax.io.archive import read_archive, write_archive
-from a2tg_jax.io.model_file import FORMAT
+from a2tg_jax.model_file import FORMAT
 from a2tg_jax.training.start import padded
 
 NUM = 40

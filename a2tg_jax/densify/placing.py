@@ -25,12 +25,12 @@ from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.origin import Color
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.table import is_table, map_rows
-from a2tg_jax.data.scene import View, counted_pixels, view_image
 from a2tg_jax.events import Change, Due, HostEvent, Times, clear_moments, times_at
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderOutput
 from a2tg_jax.render import jitted_render
 from a2tg_jax.renderer import room_for
+from a2tg_jax.scene import View, counted_pixels, view_image
 
 # Chosen in experiments/NOTEBOOK.md, "New Gaussians where pictures are wrong".
 MOST_VIEWS = 48

@@ -16,17 +16,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from a2tg_jax.base.text import counted
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_number
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree, static
-from a2tg_jax.data.scene import View, counted_pixels, views_by_kind
 from a2tg_jax.events import LEAST_LEFT, Change, Due, HostEvent, Times, keep_rows, times_at
-from a2tg_jax.host.text import counted
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import room_for
+from a2tg_jax.scene import View, counted_pixels, views_by_kind
 
 
 class _Pruning(HostEvent):

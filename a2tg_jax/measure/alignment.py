@@ -19,11 +19,11 @@ from a2tg_jax.core.cameras import Camera, moved_viewmat
 from a2tg_jax.core.checks import check_mask, check_shape
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.optim import adam_init, adam_update
-from a2tg_jax.data.scene import View, check_are_views, view_image
 from a2tg_jax.model import Model, check_is_model
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import plan_render
+from a2tg_jax.scene import View, check_are_views, view_image
 from a2tg_jax.training.losses import SSIM_WINDOW, photometric_loss
 
 NUM_STEPS = 100

@@ -30,10 +30,10 @@ import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from a2tg_jax.base.atomic import left_over, named_if_full, write_whole
+from a2tg_jax.base.operating_system import flush_folder, try_lock
+from a2tg_jax.base.regular_files import is_regular, read_regular
 from a2tg_jax.data.other_runs import model_hint
-from a2tg_jax.host.atomic import left_over, named_if_full, write_whole
-from a2tg_jax.host.operating_system import flush_folder, try_lock
-from a2tg_jax.host.regular_files import is_regular, read_regular
 
 # If the newest is damaged, training continues from the one before.
 KEPT_CHECKPOINTS = 2

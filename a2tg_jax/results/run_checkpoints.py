@@ -3,10 +3,10 @@
 import warnings
 from pathlib import Path
 
-from a2tg_jax.host.machine import this_machine
-from a2tg_jax.io.archive import read_archive_header
-from a2tg_jax.io.config_json import flatten_config
-from a2tg_jax.io.model_file import FORMAT
+from a2tg_jax.base.archive import read_archive_header
+from a2tg_jax.base.machine import this_machine
+from a2tg_jax.core.config_json import flatten_config
+from a2tg_jax.model_file import FORMAT
 from a2tg_jax.results.folder import DAMAGED, RunFolder
 from a2tg_jax.results.plan import PlannedStage
 from a2tg_jax.training import Checkpoint, System, load_checkpoint

@@ -17,11 +17,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from a2tg_jax.data.scene import Scene, views_by_kind
 from a2tg_jax.host import signals
-from a2tg_jax.io.model_file import load_model
+from a2tg_jax.model_file import load_model
 from a2tg_jax.parallel import any_process, broadcast, check_batch_size, leave
 from a2tg_jax.results.record import RunRecord
+from a2tg_jax.scene import Scene, views_by_kind
 from a2tg_jax.training import DivergedError, Session, fit_stage, load_checkpoint
 
 COMPARED = ("options", "`devices`", "views, cameras or points")

@@ -8,14 +8,13 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-from a2tg_jax.data.scene import Scene
+from a2tg_jax.base.machine import Devices
 from a2tg_jax.finish.tuning import ITERATIONS
 from a2tg_jax.host import signals
 from a2tg_jax.host.errors import error_text
-from a2tg_jax.host.machine import Devices
 from a2tg_jax.io.formats import load_splats
-from a2tg_jax.io.model_file import load_model, number_in_file, save_model
 from a2tg_jax.model import Model
+from a2tg_jax.model_file import load_model, number_in_file, save_model
 from a2tg_jax.results.commands import file_command, resuming_command
 from a2tg_jax.results.compression import SUFFIX, CompressOptions, compress
 from a2tg_jax.results.folder import RunFolder, check_free, claimed, iteration_of, put_back_old, set_aside
@@ -29,6 +28,7 @@ from a2tg_jax.results.report import RunResult
 from a2tg_jax.results.run_checkpoints import check_finished, last_state, newest_checkpoint
 from a2tg_jax.results.run_evaluation import check_held_out, check_weights, evaluate_run
 from a2tg_jax.results.run_processes import check_alike, leave_others, send_stage
+from a2tg_jax.scene import Scene
 from a2tg_jax.training import Checkpoint, DivergedError, Session, StageResult, fit_stage, save_checkpoint
 from a2tg_jax.training.loop import IsStopped, Watch, never, unwatched
 from a2tg_jax.training.recorded_views import check_names

@@ -6,6 +6,7 @@ from typing import Any, ClassVar, Self
 
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.appearance import Appearance, Bands, TexelRates, Texture, TextureOptions
+from a2tg_jax.base.text import shortened
 from a2tg_jax.core.budget import MEGABYTE, bytes_of, bytes_per_gaussian
 from a2tg_jax.core.checks import check_number
 from a2tg_jax.densify.placing import PlaceByError
@@ -13,7 +14,6 @@ from a2tg_jax.densify.pruning import Prune
 from a2tg_jax.densify.splitting import SplitByGradient
 from a2tg_jax.densify.view_dependence import AdaptDegrees
 from a2tg_jax.events import Event
-from a2tg_jax.host.text import shortened
 from a2tg_jax.mcmc import Noise, densify_times
 from a2tg_jax.systems.two_stages import PRUNING, LimitExponents, TwoStages, kernels_of, pruned
 from a2tg_jax.training.stage import Stage

@@ -7,13 +7,13 @@ import jax.numpy as jnp
 
 from a2tg_jax.appearance import Appearance, Exponents
 from a2tg_jax.appearance.parts import LARGEST_LOG_EXPONENT, MOST_SHARE
+from a2tg_jax.base.text import shortened
 from a2tg_jax.core.checks import check_number
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree
 from a2tg_jax.densify.clone_split import CloneSplitPrune, FillingDensity
 from a2tg_jax.densify.pruning import Prune, PruneFloaters, during_growth
 from a2tg_jax.events import Change, Event, Now, StepEvent, Times
-from a2tg_jax.host.text import shortened
 from a2tg_jax.mcmc import FillingMcmc, Mcmc, Noise
 from a2tg_jax.model import Model
 from a2tg_jax.training.options import System

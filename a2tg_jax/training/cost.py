@@ -9,12 +9,12 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
+from a2tg_jax.base.machine import Devices, allowed_memory, default_platform, num_threads
+from a2tg_jax.base.text import in_bytes
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.gaussians import floats_per_gaussian
-from a2tg_jax.data.scene import Scene, View, ray_bytes
 from a2tg_jax.events import HostEvent
-from a2tg_jax.host.machine import Devices, allowed_memory, default_platform, num_threads
-from a2tg_jax.host.text import in_bytes
+from a2tg_jax.scene import Scene, View, ray_bytes
 from a2tg_jax.training.batches import plan_batches, view_bytes
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Stage

@@ -16,16 +16,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from a2tg_jax.base.machine import Devices
 from a2tg_jax.core.compilations import compilations
 from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.table import Shape
-from a2tg_jax.data.scene import Scene
 from a2tg_jax.events import Change, Due, Event, HostEvent, StepEvent
-from a2tg_jax.host.machine import Devices
 from a2tg_jax.model import Model
 from a2tg_jax.parallel import any_process, check_batch_size, divided, everywhere, mesh_of, num_processes, whole
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.views import capacity_for, pairs_of_view
+from a2tg_jax.scene import Scene
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.checkpoint import COLUMNS, TERM, Checkpoint, History, Interrupted
 from a2tg_jax.training.corrections import check_corrections

@@ -17,10 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.data.scene import View, view_image
+from a2tg_jax.base.text import counted, in_bytes
 from a2tg_jax.events import Change, HostEvent, Times
 from a2tg_jax.host.progress_bars import has_terminal, is_line_due, new_bar
-from a2tg_jax.host.text import counted, in_bytes
+from a2tg_jax.scene import View, view_image
 from a2tg_jax.training.batches import BatchOrder
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Background, Stage

@@ -17,6 +17,8 @@ import jax
 import numpy as np
 
 import a2tg_jax as a2tg
+from a2tg_jax.base.json_text import read_json
+from a2tg_jax.base.machine import num_threads, tidy_memory
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.gaussians import floats_per_gaussian, no_rows
 from a2tg_jax.core.numerics import evenly_chosen
@@ -25,8 +27,6 @@ from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.data.assembly import with_validation_views
 from a2tg_jax.data.load import SceneSource
 from a2tg_jax.data.synthetic import BUILT_IN
-from a2tg_jax.host.json_text import read_json
-from a2tg_jax.host.machine import num_threads, tidy_memory
 from a2tg_jax.host.source_commit import source_commit
 from a2tg_jax.results.folder import write_json
 from a2tg_jax.training import fit_stage
