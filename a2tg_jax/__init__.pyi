@@ -114,7 +114,7 @@ from .mesh.triangles import (
 from .model import Model as Model, concatenate as concatenate
 from .model_file import load_model as load_model, save_model as save_model
 from .rasterize.render_types import Geometry as Geometry, RenderOutput as RenderOutput, RenderSettings as RenderSettings
-from .rasterize.views import EmptyRenderWarning as EmptyRenderWarning
+from .rasterize.room import EmptyRenderWarning as EmptyRenderWarning
 from .render import (
     CapacityWarning as CapacityWarning,
     render_appearance as render_appearance,

@@ -396,14 +396,14 @@ def test_a_sweep_compiles_each_step_once(scene, name, event, thresholds):
     if name == "a2tg":
         fixed["texture"] = {"at": [0.5]}
     for changes in [*VARIANTS, *({event: threshold} for threshold in thresholds)]:
-        rooms = copy.deepcopy(session.capacities)
+        rooms = copy.deepcopy(session.room)
         merged = {key: {**fixed.get(key, {}), **changes.get(key, {})} for key in ("loss", "texture")}
         merged = {**changes, **{key: value for key, value in merged.items() if value}}
         with compiled_programs("train_step") as programs:
             result = a2tg.fit(scene, tiny(name, **merged), progress=False, session=session)
         # Lists that grow in the middle of a run are compiled again; a run records how often that was.
         count = max(0, len(programs) - result.num_regrown)
-        counts.append((count, session.capacities == rooms))
+        counts.append((count, session.room == rooms))
         scales.append(float(jnp.mean(result.stages[0].model.gaussians.scales)))
     # So are lists that must be longer from the start, as where a seed puts more splats on the screen. The events of
     # another rule (select) are another program.

@@ -29,7 +29,7 @@ from a2tg_jax.events import Change, Due, HostEvent, Times, clear_moments, times_
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderOutput
 from a2tg_jax.render import jitted_render
-from a2tg_jax.renderer import room_for
+from a2tg_jax.renderer import plan_render
 from a2tg_jax.scene import View, counted_pixels, view_image
 
 # Chosen in experiments/NOTEBOOK.md, "New Gaussians where pictures are wrong".
@@ -117,7 +117,7 @@ def gaussians_at_errors(
         raise ValueError("views must hold at least one view; got none")
     views = evenly_chosen(views, MOST_VIEWS)
     dtype = model.gaussians.means.dtype
-    settings = room_for(model, [view.camera for view in views])
+    settings = plan_render(model, [view.camera for view in views])
     behind = jnp.asarray(background, dtype)
     totals = []
     drawn = []

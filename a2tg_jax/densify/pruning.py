@@ -25,7 +25,7 @@ from a2tg_jax.events import LEAST_LEFT, Change, Due, HostEvent, Times, keep_rows
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.views import render_traced
-from a2tg_jax.renderer import room_for
+from a2tg_jax.renderer import plan_render
 from a2tg_jax.scene import View, counted_pixels, views_by_kind
 
 
@@ -114,7 +114,7 @@ def shown_in(model: Model, views: Sequence[View], least: float = 1.0) -> Contrib
     if not len(total):
         return Contributions(total, num_views)
     dtype = model.gaussians.means.dtype
-    settings = room_for(model, [view.camera for view in views])
+    settings = plan_render(model, [view.camera for view in views])
     for alike in views_by_kind(views):
         rays = alike[0].camera.rays
         rays = None if rays is None else jnp.asarray(rays, dtype)

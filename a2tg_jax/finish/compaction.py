@@ -150,8 +150,7 @@ def _drawing(
     if not cameras:
         raise ValueError("there are no views to measure a loss on")
     options: dict[str, Any] = {"background": background, "settings": settings, "has_geometry": False}
-    # With twice the given model's capacity, programs usually compile once.
-    capacities = {size: 2 * num for size, num in Renderer(model, cameras=cameras, **options).capacities.items()}
+    capacities = Renderer(model, cameras=cameras, **options).capacities
 
     def draw(other: Model) -> Iterator[np.ndarray]:
         renderer = Renderer(other, capacities=capacities, **options)

@@ -9,7 +9,7 @@ import dataclasses
 import datetime
 import time
 import warnings
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -24,7 +24,7 @@ from a2tg_jax.events import Change, Due, Event, HostEvent, StepEvent
 from a2tg_jax.model import Model
 from a2tg_jax.parallel import any_process, check_batch_size, divided, everywhere, mesh_of, num_processes, whole
 from a2tg_jax.rasterize.render_types import RenderSettings
-from a2tg_jax.rasterize.views import capacity_for, pairs_of_view
+from a2tg_jax.rasterize.room import TileRoom, most_pairs
 from a2tg_jax.scene import Scene
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.checkpoint import COLUMNS, TERM, Checkpoint, History, Interrupted
@@ -59,7 +59,7 @@ WORTH_COMPILING = 1_000
 PLANNED_VIEWS = 64
 """Largest number of views that room is planned for."""
 GROWTH_ROOM = 1.5
-"""Room as a multiple of what the present model needs."""
+"""Pairs that lists may reach while a model is trained, as a multiple of the present ones."""
 
 Size = tuple[int, int]
 """Height and width of a view, in pixels."""
@@ -120,22 +120,8 @@ class Session:
         """Numbers of devices of a process and of processes."""
         self.shapes: set[Shape] = set()
         """Shapes of textures."""
-        self.capacities: dict[Hashable, set[int]] = {}
-        """Capacities of tile lists, by appearance, number of rows and image size."""
-
-    def capacity(self, place: Hashable, needed: int) -> int:
-        """Return the largest known capacity up to twice the pairs that are needed, or else a new one.
-
-        Capacities are kept by place: an appearance, a number of rows and an image size.
-        """
-        capacities = self.capacities.setdefault(place, set())
-        # Few different capacities, at most half as large again as needed.
-        power = 2 ** (needed.bit_length() - 1)
-        rounded = next(room for room in (power, power + power // 2, 2 * power) if room >= needed)
-        # The largest, because lists that overflowed in an earlier run would overflow again.
-        capacity = max((room for room in capacities if needed <= room <= 2 * needed), default=rounded)
-        capacities.add(capacity)
-        return capacity
+        self.room = TileRoom()
+        """Capacities of tile lists, by appearance, rows and image size."""
 
 
 class StageRun:
@@ -393,17 +379,14 @@ class StageRun:
             views = [view for view in self.views if view.picture.size == size]
             sample = evenly_chosen(views, PLANNED_VIEWS)
             cameras = [jax.tree.map(lambda x: jnp.asarray(x, dtype), view.camera) for view in sample]
-            pairs = max(
-                pairs_of_view(model.gaussians, camera, appearance, settings, model.num_live) for camera in cameras
-            )
+            pairs = most_pairs(model.gaussians, cameras, appearance, settings, model.num_live)
             growth = (model.gaussians.num / max(model.num, 1)) ** 0.5
-            self.capacities[size] = self._capacity(size, pairs * GROWTH_ROOM * growth)
+            self.capacities[size] = self.session.room.plan(self._place(size), pairs * GROWTH_ROOM * growth)
         return dataclasses.replace(settings, capacity=self.capacities[size])
 
-    def _capacity(self, size: Size, pairs: float) -> int:
-        """Return a capacity for a number of pairs in views of a size, if possible one of the session's."""
-        stage = self.stage.appearance, self.state.model.gaussians.num
-        return self.session.capacity((*stage, *size), capacity_for(int(pairs)))
+    def _place(self, size: Size) -> tuple[object, ...]:
+        """Return the key of a capacity of the session: stages that show the same share it."""
+        return self.stage.appearance, self.state.model.gaussians.num, *size
 
     def _mend(self, iteration: int, info: StepInfo) -> None:
         """Make more room for the tile lists; raise an error for every other cause."""
@@ -412,7 +395,8 @@ class StageRun:
         if info.status == OVERFLOW:
             self.num_regrown += 1
             size = self._size(iteration)
-            self.capacities[size] = self._capacity(size, float(info.num_pairs) * GROWTH_ROOM)
+            pairs = GROWTH_ROOM * float(info.num_pairs)
+            self.capacities[size] = self.session.room.enlarge(self._place(size), pairs)
             return
         where = f"at iteration {iteration} of stage {self.stage.name}"
         if info.status in (NOT_FINITE, EXPLODED):
