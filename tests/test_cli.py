@@ -26,7 +26,7 @@ from a2tg_jax.cli.train import Train, train_defaults
 from a2tg_jax.data.load import SceneSource
 from a2tg_jax.host import startup
 from a2tg_jax.io.compact import unframed
-from a2tg_jax.results import finishing, run_training, viewing
+from a2tg_jax.results import finishing, run_training, stage_training, viewing
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.frames import LIST
 from a2tg_jax.results.history import read_history
@@ -52,7 +52,7 @@ def tiny_run(tmp_path_factory):
     """A run interrupted after the first checkpoint of its textures and resumed, with both exit codes."""
     out = tmp_path_factory.mktemp("cli") / "run"
     arguments = ["train", "synthetic", "--out", str(out), *TENSORBOARD]
-    save = run_training.save_checkpoint
+    save = stage_training.save_checkpoint
 
     def save_and_interrupt(path, checkpoint):
         save(path, checkpoint)
@@ -61,7 +61,7 @@ def tiny_run(tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cli, "configure_cpu", lambda: None)
-        patch.setattr(run_training, "save_checkpoint", save_and_interrupt)
+        patch.setattr(stage_training, "save_checkpoint", save_and_interrupt)
         interrupted = cli.main([*arguments, *TINY])
         patch.undo()
         patch.setattr(cli, "configure_cpu", lambda: None)

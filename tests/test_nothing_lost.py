@@ -38,7 +38,7 @@ from a2tg_jax.base.regular_files import sha256_of
 from a2tg_jax.cli import main as cli, runs
 from a2tg_jax.host import signals
 from a2tg_jax.host.errors import error_text
-from a2tg_jax.results import compression, forecast, run_evaluation, run_training
+from a2tg_jax.results import compression, forecast, run_evaluation, run_training, stage_training
 from a2tg_jax.results.folder import OLD, RunFolder, old_run, opened, put_back_old, set_aside
 from a2tg_jax.results.output_paths import check_apart
 from a2tg_jax.results.record import RunRecord, SceneSource, read_record, read_run_file, write_record
@@ -252,7 +252,7 @@ def test_a_run_without_a_checkpoint_replaces_nothing(tmp_path, monkeypatch, caps
 def test_a_replacement_that_was_stopped_keeps_the_old_run_and_continues(tmp_path, monkeypatch, capsys):
     run = filled(tmp_path / "run")
     with monkeypatch.context() as patch:
-        patch.setattr(run_training, "save_checkpoint", saving_until(4))
+        patch.setattr(stage_training, "save_checkpoint", saving_until(4))
         assert cli.main([*TRAIN, "--seed", "5", "--out", str(run.path), "--overwrite"]) == 130
     assert f"{NAME}-0000000004.npz; continue with: a2tg train --out {run.path} --resume" in capsys.readouterr().err
     kept = old_run(run)
@@ -320,7 +320,7 @@ def stopped(scene, tmp_path_factory):
         run = create_run(folder / name)
         write_record(run, RECORD)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(run_training, "save_checkpoint", function)
+            patch.setattr(stage_training, "save_checkpoint", function)
             with contextlib.suppress(KeyboardInterrupt):
                 train_run(run, scene, QUIET)
     return RunFolder(folder / "run"), load_model(RunFolder(folder / "whole").model(NAME))
@@ -448,7 +448,7 @@ def test_restoring_takes_another_order_and_resuming_repeats_it(scene, tmp_path, 
     other, numbers = trapped_run(scene, tmp_path / "other", "restore"), []
     with monkeypatch.context() as patch, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        patch.setattr(run_training, "save_checkpoint", saving_until(8, 14, noted=numbers))
+        patch.setattr(stage_training, "save_checkpoint", saving_until(8, 14, noted=numbers))
         for _ in range(2):
             with pytest.raises(KeyboardInterrupt):
                 train_run(other, scene, QUIET)
@@ -516,7 +516,7 @@ def test_a_second_signal_ends_the_program_at_once():
 
 
 def test_errors_of_training_come_with_advice(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(run_training, "save_checkpoint", raising(OSError(28, "No space left on device")))
+    monkeypatch.setattr(stage_training, "save_checkpoint", raising(OSError(28, "No space left on device")))
     assert cli.main([*TRAIN, "--out", str(tmp_path / "run")]) == 2
     error = capsys.readouterr().err.splitlines()[-1]
     printed = "the disk is full: make room, or write to another disk"

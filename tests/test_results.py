@@ -473,8 +473,8 @@ def test_shared_stages_are_trained_once():
         "density-continued",
     )  # fmt: skip
     assert plan.chains["fixed"] == ("main-gaussians", "fixed-textures")
-    assert [planned.start for planned in plan.stages][1:4] == ["main-gaussians"] * 3
-    assert plan.first_iteration("density-continued") == 1_500
+    assert [planned.start for planned in plan.stages][1:4] == [plan["main-gaussians"]] * 3
+    assert plan["density-continued"].first_iteration == 1_500
     shaped = A2tg.preset("quick")
     plan = plan_run({"main": shaped, "baseline": like(Gaussians2dMcmc, shaped)})
     assert plan.chains["baseline"] == ("baseline-gaussians", "baseline-continued"), "plain Gaussians have no shapes"

@@ -96,7 +96,7 @@ class RunResult:
     def before(self) -> list[str]:
         """The stage that the main model started from, if it has one."""
         start = self.plan[self.main].start
-        return [] if start is None else [start]
+        return [] if start is None else [start.name]
 
     @property
     def compared(self) -> list[str]:
