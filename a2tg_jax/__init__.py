@@ -19,7 +19,7 @@ def __getattr__(name: str) -> Any:
     if name not in __all__ and importlib.util.find_spec(f"{__name__}.{name}") is not None:
         return importlib.import_module(f"{__name__}.{name}")
     # Most names start JAX.
-    importlib.import_module(f"{__name__}.host.machine").check_ulimits()
+    importlib.import_module(f"{__name__}.base.machine").check_ulimits()
     return _import_name(name)
 
 

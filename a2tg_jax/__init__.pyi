@@ -17,6 +17,7 @@ from .appearance import (
     allocate_appearance as allocate_appearance,
     project_appearance as project_appearance,
 )
+from .base.machine import set_num_threads as set_num_threads
 from .core.bilinear import TextureRegion as TextureRegion
 from .core.camera_paths import look_at as look_at, path_through as path_through, smooth_path as smooth_path
 from .core.cameras import Camera as Camera, resize_camera as resize_camera
@@ -28,6 +29,7 @@ from .core.optim import (
     exponential_decay as exponential_decay,
 )
 from .core.origin import Origin as Origin
+from .core.pictures import DepthMap as DepthMap, Mask as Mask, Picture as Picture
 from .core.pytree import (
     combine as combine,
     partition as partition,
@@ -39,8 +41,6 @@ from .core.similarity import Similarity as Similarity, transform_gaussians as tr
 from .data.arrays import scene_from_arrays as scene_from_arrays
 from .data.assembly import with_validation_views as with_validation_views
 from .data.load import load_scene as load_scene
-from .data.photo_store import DepthMap as DepthMap, Mask as Mask, Picture as Picture
-from .data.scene import Scene as Scene, View as View, view_image as view_image
 from .data.sfm import SfmSummary as SfmSummary, run_sfm as run_sfm
 from .data.synthetic import cells_scene as cells_scene, synthetic_scene as synthetic_scene
 from .densify.clone_split import (
@@ -61,7 +61,6 @@ from .events import (
     Now as Now,
     Seen as Seen,
     StepEvent as StepEvent,
-    Times as Times,
     keep_rows as keep_rows,
 )
 from .finish.compaction import (
@@ -74,13 +73,11 @@ from .finish.compaction import (
 from .finish.polishing import polish as polish
 from .finish.shrinking import shrink_textures as shrink_textures
 from .finish.tuning import Tuned as Tuned, tune_compact as tune_compact
-from .host.machine import set_num_threads as set_num_threads
 from .host.startup import configure_cpu as configure_cpu
 from .io.compact import CompactChoices as CompactChoices, load_compact as load_compact, save_compact as save_compact
 from .io.edit_file import Box as Box, Edit as Edit, apply_edit as apply_edit, load_edit as load_edit
 from .io.formats import load_splats as load_splats, save_splats as save_splats
 from .io.gltf import load_gltf as load_gltf, save_gltf as save_gltf
-from .io.model_file import load_model as load_model, save_model as save_model
 from .io.ply import load_ply as load_ply, save_ply as save_ply
 from .io.torch_checkpoint import to_gsplat as to_gsplat
 from .io.usd import load_usd as load_usd, save_usd as save_usd
@@ -115,14 +112,16 @@ from .mesh.triangles import (
     surface_distance as surface_distance,
 )
 from .model import Model as Model, concatenate as concatenate
+from .model_file import load_model as load_model, save_model as save_model
 from .rasterize.render_types import Geometry as Geometry, RenderOutput as RenderOutput, RenderSettings as RenderSettings
-from .rasterize.views import EmptyRenderWarning as EmptyRenderWarning
+from .rasterize.room import EmptyRenderWarning as EmptyRenderWarning
 from .render import (
     CapacityWarning as CapacityWarning,
     render_appearance as render_appearance,
     render_image as render_image,
 )
 from .renderer import Renderer as Renderer, plan_render as plan_render
+from .scene import Scene as Scene, View as View, view_image as view_image
 from .systems.a2tg import A2tg as A2tg
 from .systems.baselines import (
     BBSplat as BBSplat,

@@ -17,7 +17,7 @@ from a2tg_jax.core.checks import check_int, check_literal, check_number, check_s
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.table import Shape, bucket_capacity, resize
-from a2tg_jax.events import Change, Due, GradientStatistics, HostEvent, Statistic, iterations_at
+from a2tg_jax.events import Change, Due, GradientStatistics, HostEvent, Statistic, Times, times_at
 from a2tg_jax.model import Model
 from a2tg_jax.texture import BYTES_PER_TEXEL, MAX_SIDE, Textures, check_textures, checked_sizes
 
@@ -49,7 +49,7 @@ class Upscale(HostEvent):
 
     Examples:
       >>> event = a2tg.Upscale(select="fraction", fraction=0.1, cap=8, at=(0.25, 0.5))
-      >>> event.iterations(1000)
+      >>> event.times(1000)
       (250, 500)
     """
 
@@ -113,15 +113,15 @@ class Upscale(HostEvent):
                 raise ValueError(
                     f"{name} is {number}, but select is {self.select!r}: set select to {rule!r}, or leave {name} out"
                 )
-        self.iterations(PAPER_ITERATIONS)  # checks `at`
+        self.times(PAPER_ITERATIONS)  # checks `at`
 
-    def iterations(self, num_iterations: int) -> tuple[int, ...]:
+    def times(self, num_iterations: int) -> Times:
         fractions = self.at
         if fractions is None:
             interval = SHORT_INTERVAL if num_iterations < PAPER_ITERATIONS else PAPER_INTERVAL
             rounds = math.ceil(math.log2(self.cap))
             fractions = tuple(interval * (index + 1) for index in range(rounds))
-        return iterations_at(fractions, num_iterations)
+        return times_at(fractions, num_iterations)
 
     @property
     def _budget_bytes(self) -> int:
@@ -130,7 +130,7 @@ class Upscale(HostEvent):
 
     def most_bytes(self, num_bytes: float, num: int, num_iterations: int) -> float:
         # An upscaling doubles both sides at most.
-        texels = min(4.0 ** len(self.iterations(num_iterations)), self.cap**2)
+        texels = min(4.0 ** len(self.times(num_iterations)), self.cap**2)
         if self.select == "budget":
             return max(num_bytes, min(self._budget_bytes, num_bytes + BYTES_PER_TEXEL * num * texels))
         # Mostly the same textures grow each time, so one share of them reaches the largest size, from one texel. From

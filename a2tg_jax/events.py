@@ -17,6 +17,7 @@ from jax import Array
 from jax.typing import DTypeLike
 
 from a2tg_jax.appearance.base import clear_rows
+from a2tg_jax.base.text import shortened
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_floats, check_mask, check_shape
 from a2tg_jax.core.named_fields import NamedFields
@@ -25,48 +26,42 @@ from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.origin import BLACK, Color
 from a2tg_jax.core.pytree import combine, partition, pytree
 from a2tg_jax.core.table import Shape, map_rows, rows_moved
-from a2tg_jax.data.scene import View
-from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.pixel import Statistic as Statistic
+from a2tg_jax.scene import View
 
 LEAST_LEFT = 2
 """Smallest number of Gaussians that training needs."""
 
 
-class Times(NamedTuple):
-    """Every `every` iterations, from 1, between a first and a last, both included. Host numbers, or traced."""
-
-    first: Any
-    """Iteration before which it never happens."""
-    last: Any
-    """Last iteration at which it may happen."""
-    every: Any
-    """Number of iterations between two times; it happens at multiples of it."""
-
-    def is_due(self, iteration: object) -> Array:
-        """Return whether the event follows this iteration."""
-        # `&`, not `and`: the numbers may be traced.
-        return (iteration >= self.first) & (iteration <= self.last) & (iteration % self.every == 0)
-
-    def num_left(self, iteration: Any) -> Any:
-        """Return the number of its times from an iteration on."""
-        # The multiples of `every` up to the last time, without those before this iteration.
-        return self.last // self.every - (iteration - 1) // self.every
-
-    @property
-    def last_time(self) -> int:
-        """Iteration of the last time (host)."""
-        return int(self.last - self.last % self.every)
-
-    @property
-    def num_times(self) -> int:
-        """Number of all its times (host)."""
-        return max(0, int(self.num_left(max(1, self.first))))
+Times = Sequence[int]
+"""Iterations of a stage after which an event happens, from 1, ascending: a range or a tuple."""
 
 
-EVERY_ITERATION = Times(1, 2**31 - 1, 1)  # the largest int32
-NEVER = Times(1, 0, 1)
+def times_at(fractions: tuple[float, ...], num_iterations: int, *, with_end: bool = False) -> Times:
+    """Return the times at fractions of a stage; in a short stage two of them may be one (host).
+
+    The last fraction of the event's field `at` may be 1, the end of the stage, if `with_end`.
+
+    Raises:
+      ValueError: if the fractions are not ascending or out of range.
+    """
+    is_inside = all(0 < fraction < 1 or (with_end and fraction == 1) for fraction in fractions)
+    if not is_inside or list(fractions) != sorted(set(fractions)):
+        limits = "above 0, up to 1" if with_end else "between 0 and 1"
+        raise ValueError(f"at must be ascending fractions {limits}; got {shortened(fractions)}")
+    # Iterations count from 1: at 0 the event would never happen.
+    return tuple(dict.fromkeys(max(1, round(fraction * num_iterations)) for fraction in fractions))
+
+
+def multiples(every: int, first: int, last: int) -> Times:
+    """Return the multiples of a number of iterations from `first`, which is at least 1, to `last`, both included."""
+    return range(-(-first // every) * every, last + 1, every)
+
+
+def every_iteration(num_iterations: int) -> Times:
+    """Return all iterations of a stage."""
+    return range(1, num_iterations + 1)
 
 
 class Seen(NamedTuple):
@@ -96,8 +91,8 @@ class Now(NamedTuple):
     """Length of the stage."""
     scene_scale: Array
     """1.1 × the largest distance of a camera from the cameras' mean."""
-    times: Times | None = None
-    """Times at which the event happens; None: after every iteration."""
+    num_left: Array | None = None
+    """Number of times at which the event still happens, this one included; None if it happens after every iteration."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,6 +148,11 @@ class Event(NamedFields):
     limited_by: ClassVar[str] = ""
     """Field that bounds the number of Gaussians, such as "cap": training starts from at most that many, and messages
     name it."""
+
+    def times(self, num_iterations: int) -> Times:
+        """Return the iterations of a stage of `num_iterations` after which the event happens, ascending: a range or a
+        tuple, such as `range(100, num_iterations // 2, 100)` (host)."""
+        raise NotImplementedError(f"{type(self).__name__} must define times(num_iterations)")
 
     def check_options(self) -> None:
         """Check the ranges of the fields (host). A stage calls it, and a system whose option the event is.
@@ -229,8 +229,8 @@ class StepEvent(Event):
     """Reason why training cannot continue if `EventInfo.is_possible` is False, in terms of the event's fields."""
 
     def times(self, num_iterations: int) -> Times:
-        """Return the times of the event in a stage of `num_iterations` (host)."""
-        return EVERY_ITERATION
+        """Return the iterations after which the event happens; by default all (host)."""
+        return every_iteration(num_iterations)
 
     def apply(self, now: Now, model: Model, moments: AdamState, state: Any) -> Change:
         """Return the model after the event; traced."""
@@ -240,17 +240,13 @@ class StepEvent(Event):
 class HostEvent(Event):
     """Event between steps on the host, where values may be read and shapes may change."""
 
-    def iterations(self, num_iterations: int) -> tuple[int, ...]:
-        """Return the iterations of a stage after which it happens, ascending."""
-        raise NotImplementedError(f"{type(self).__name__} must define iterations(num_iterations)")
-
     def num_programs(self, num_iterations: int) -> int:
         """Return roughly how many programs are compiled because of it, for forecasts (host).
 
         The default is one each time before the end of the stage. Override it if shapes stay (`keep_rows`).
         """
         # After the last iteration there is no step to compile.
-        return sum(1 <= iteration < num_iterations for iteration in self.iterations(num_iterations))
+        return sum(1 <= iteration < num_iterations for iteration in self.times(num_iterations))
 
     def with_room(
         self, model: Model, moments: AdamState, num_bytes: float, num_iterations: int
@@ -265,22 +261,6 @@ class HostEvent(Event):
     def apply(self, due: Due, model: Model, moments: AdamState, state: Any) -> Change:
         """Return the model after the event (host)."""
         raise NotImplementedError(f"{type(self).__name__} must define apply(due, model, moments, state)")
-
-
-def iterations_at(fractions: tuple[float, ...], num_iterations: int, *, with_end: bool = False) -> tuple[int, ...]:
-    """Return the iterations at fractions of a stage, ascending; in a short stage two of them may be one (host).
-
-    The last fraction of the event's field `at` may be 1, the end of the stage, if `with_end`.
-
-    Raises:
-      ValueError: if the fractions are not ascending or out of range.
-    """
-    is_inside = all(0 < fraction < 1 or (with_end and fraction == 1) for fraction in fractions)
-    if not is_inside or list(fractions) != sorted(set(fractions)):
-        limits = "above 0, up to 1" if with_end else "between 0 and 1"
-        raise ValueError(f"at must be ascending fractions {limits}; got {shortened(fractions)}")
-    # Iterations count from 1: at 0 the event would never happen.
-    return tuple(dict.fromkeys(max(1, round(fraction * num_iterations)) for fraction in fractions))
 
 
 def keep_rows(model: Model, moments: AdamState, state: object, is_kept: Array | np.ndarray) -> Change:

@@ -22,7 +22,7 @@ from a2tg_jax.core.gaussians import DEAD_OPACITY, MAX_SHARES, Gaussians, check_g
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.table import bucket_capacity
-from a2tg_jax.events import NEVER, Change, EventInfo, Now, StepEvent, Times, clear_moments, gather_rows
+from a2tg_jax.events import Change, EventInfo, Now, StepEvent, Times, clear_moments, gather_rows, multiples
 from a2tg_jax.model import Model
 
 # Constants of 3DGS-MCMC's program.
@@ -298,7 +298,7 @@ def _check_moments(gaussians: Gaussians, moments: object, num_live: Array | int)
 def densify_times(num_iterations: int) -> Times:
     """Return the times of densification: the paper's 500, 25,000 and every 100 of 30,000 iterations, scaled."""
     every = max(10, round(num_iterations / 300))
-    return Times(round(num_iterations / 60), int(5 / 6 * num_iterations + 1e-9), every)
+    return multiples(every, max(1, round(num_iterations / 60)), int(5 / 6 * num_iterations + 1e-9))
 
 
 @pytree
@@ -337,7 +337,7 @@ class Mcmc(StepEvent):
             check_number("cap", self.cap, least=2)
 
     def times(self, num_iterations: int) -> Times:
-        return densify_times(num_iterations) if self.cap else NEVER
+        return densify_times(num_iterations) if self.cap else ()
 
     @property
     def most_gaussians(self) -> int | None:
@@ -351,9 +351,8 @@ class Mcmc(StepEvent):
 
     def grown(self, num: int, num_iterations: int) -> int:
         """Return the number of Gaussians after growth from `num` (host)."""
-        times = self.times(num_iterations)
-        for iteration in range(times.every, times.last + 1, times.every):
-            if num < self.cap and iteration >= times.first:
+        for _ in self.times(num_iterations):
+            if num < self.cap:
                 num = min(self.cap, max(num + 1, num + num // 20))
         return num
 
@@ -389,7 +388,7 @@ class FillingMcmc(Mcmc):
         check_number("cap", self.cap, least=2)
 
     def num_rows(self, num: int, num_iterations: int) -> int:
-        if num < self.cap and not self.times(num_iterations).num_times:
+        if num < self.cap and not self.times(num_iterations):
             raise ValueError(
                 f"cap has room for {self.cap:,} Gaussians, but in {num_iterations} iterations there is no growth from "
                 f"{num:,}"
@@ -397,5 +396,5 @@ class FillingMcmc(Mcmc):
         return max(num, self.cap)
 
     def least(self, now: Now, num_live: Array) -> Array | int:
-        assert now.times is not None
-        return number_to_reach(num_live, self.cap, now.times.num_left(now.iteration))
+        assert now.num_left is not None
+        return number_to_reach(num_live, self.cap, now.num_left)

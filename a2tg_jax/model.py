@@ -13,19 +13,34 @@ from jax.typing import ArrayLike
 
 from a2tg_jax.appearance import Appearance, count_floats, in_words, template_of
 from a2tg_jax.appearance.base import check_appearance, check_arrays_given, join_rows, num_colors_of, take_rows
-from a2tg_jax.appearance.parts import MAX_DEGREE, bands_of_dense, degrees_of_sizes, dense_bands
+from a2tg_jax.appearance.parts import (
+    LEAST_OPACITY,
+    MAX_DEGREE,
+    bands_of_dense,
+    degrees_of_sizes,
+    dense_bands,
+    nearest_gaussians,
+)
+from a2tg_jax.base.text import counted, in_bytes
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.checks import check_kind, check_shape, check_unmasked, short_repr
-from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.core.checks import (
+    LARGEST_NUMBER,
+    check_bounded,
+    check_count,
+    check_kind,
+    check_shape,
+    check_unmasked,
+    short_repr,
+)
+from a2tg_jax.core.gaussians import LARGEST_LOG_SCALE, LARGEST_OPACITY, Gaussians, check_gaussians, logit
 from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.notebook_display import html_table
-from a2tg_jax.core.origin import BLACK, Color, Origin
+from a2tg_jax.core.origin import BLACK, Color, Origin, check_origin
 from a2tg_jax.core.pytree import beside, pytree, static
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity, transform_gaussians
 from a2tg_jax.core.table import map_rows
-from a2tg_jax.host.text import counted, in_bytes
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
 from a2tg_jax.render import render_appearance, with_features
 from a2tg_jax.texture import Textures, check_textures
@@ -342,3 +357,61 @@ def concatenate(models: Sequence[Model]) -> Model:
     appearances = [model.appearance for model in models]
     gaussians, appearance = join_rows([*zip(several, appearances, strict=True)])
     return dataclasses.replace(first, gaussians=gaussians, appearance=appearance)
+
+
+def checked_live(model: Model) -> Model:
+    """Return the live rows of a valid model. ValueError: it is invalid."""
+    check_is_model(model)
+    check_gaussians(model.gaussians, "model.gaussians")
+    model = model.live
+    check_model(model)
+    return model
+
+
+def check_model(model: Model) -> None:
+    """Raise ValueError, naming the field, unless a model can be rendered and trained.
+
+    All fields have their shapes and one dtype, all numbers are finite, the appearance has a row for each Gaussian, and
+    rows of textures and coefficients are within their tables.
+    """
+    gaussians = model.gaussians
+    check_gaussians(gaussians)
+    check_appearance(model.appearance, gaussians)
+    check_bounded("gaussians", gaussians)
+    check_bounded("appearance", model.appearance)
+    if not (np.abs(model.background) <= LARGEST_NUMBER).all():  # False for NaN.
+        raise ValueError(f"background must be finite, within ±{LARGEST_NUMBER:g}; got {model.background}")
+    largest = np.asarray(gaussians.log_scales).max(initial=-np.inf)
+    if largest > LARGEST_LOG_SCALE:
+        raise ValueError(
+            f"gaussians.log_scales must be logarithms of finite scales, up to {LARGEST_LOG_SCALE:.2f}, of scales up to "
+            f"{LARGEST_NUMBER:g}; got {largest:g}"
+        )
+    if model.num_live is not None:
+        check_count("num_live", model.num_live, gaussians.num)
+    if model.origin is not None:
+        check_origin(model.origin)
+
+
+def plain_gaussians(gaussians: Gaussians | Model, *, keeps_shapes: bool = False) -> Gaussians:
+    """Return the Gaussians of a model without its appearance, in the model's world.
+
+    They have their own opacities, and all spherical harmonics of the model.
+
+    Args:
+      gaussians: as in `save_ply`.
+      keeps_shapes: the file also keeps kernel shapes. If not, each kernel becomes the nearest Gaussian.
+    """
+    if isinstance(gaussians, Model):
+        model = gaussians.live
+        check_appearance(model.appearance, model.gaussians)
+        shown = model.appearance
+        gaussians = dataclasses.replace(model.gaussians, sh=jnp.asarray(model.sh))
+        if shown.shapes is not None and not keeps_shapes:
+            gaussians = nearest_gaussians(gaussians, np.asarray(shown.shapes))
+        if not shown.has_own_opacities:
+            # Logits must be finite.
+            opacities = jnp.clip(shown.opacities(model.gaussians), LEAST_OPACITY, LARGEST_OPACITY)
+            gaussians = dataclasses.replace(gaussians, logit_opacities=logit(opacities))
+    check_gaussians(gaussians)
+    return gaussians

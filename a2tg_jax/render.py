@@ -24,7 +24,8 @@ from a2tg_jax.core.cameras import Camera, check_camera
 from a2tg_jax.core.checks import check_floats, check_kind, check_shape, check_unmasked, dtype_of, plain_array
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
-from a2tg_jax.rasterize.views import has_rows, render_traced, warn_of_empty, with_capacity
+from a2tg_jax.rasterize.room import has_rows, warn_of_empty, with_capacity
+from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.texture import Textures, check_textures
 
 
@@ -127,7 +128,7 @@ def render_appearance(
 
 @functools.cache
 def jitted_render() -> Callable[..., tuple[RenderOutput, Array]]:
-    """Return `render_traced` under jit; its cache counts the compilations."""
+    """Return `render_traced` under jit."""
     # Made at the first call: importing this library calls no `jax.jit`.
     return jax.jit(render_traced, static_argnums=(4,), static_argnames=("has_geometry",))
 

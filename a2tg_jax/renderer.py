@@ -8,21 +8,17 @@ from numpy.typing import ArrayLike
 
 from a2tg_jax.appearance import Appearance, check_is_appearance
 from a2tg_jax.appearance.base import num_colors_of
+from a2tg_jax.base.text import counted
 from a2tg_jax.core.cameras import Camera, check_camera, checked_cameras, resize_camera
 from a2tg_jax.core.checks import check_kind, check_number
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.numerics import evenly_chosen
-from a2tg_jax.host.text import counted
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
-from a2tg_jax.rasterize.views import HEAD_ROOM, capacity_for, has_rows, pairs_of_view, warn_of_empty
+from a2tg_jax.rasterize.room import HEAD_ROOM, TileRoom, has_rows, most_pairs, warn_of_empty
 from a2tg_jax.render import appearance_of, background_array, jitted_render
 from a2tg_jax.texture import Textures
 
-FIRST_ROOM = 1.5
-"""Head room of the first capacity."""
-GROWTH = 3
-"""Least factor by which a capacity grows."""
 PLANNED_CAMERAS = 16
 """Number of a model's own cameras for which the first capacity is planned."""
 
@@ -81,24 +77,17 @@ def plan_render(
     elif textures is not None:
         raise ValueError("give an appearance or textures, not both")
     check_is_appearance(appearance, gaussians)
-    most = max(pairs_of_view(gaussians, camera, appearance, settings, num_live) for camera in cameras)
+    most = most_pairs(gaussians, cameras, appearance, settings, num_live)
     if most == 0 and has_rows(gaussians, num_live):
         warn_of_empty("any of the cameras", stacklevel=3)
-    return dataclasses.replace(settings, capacity=capacity_for(most, head_room))
-
-
-def room_for(model: Model, cameras: Sequence[Camera]) -> RenderSettings:
-    """Return settings with room for a model's tile lists in each view (host)."""
-    settings = plan_render(model, cameras)
-    # A power of two, so that programs are compiled for few capacities.
-    return dataclasses.replace(settings, capacity=1 << (settings.capacity or 1).bit_length())
+    return dataclasses.replace(settings, capacity=TileRoom().plan(None, most, head_room))
 
 
 class Renderer:
     """Renderer of one model from any camera.
 
     Each image size is compiled for a capacity that suffices for the first view and the model's own cameras. A view that
-    needs more is drawn again with at least three times the capacity. A long flight therefore compiles only a few times,
+    needs more is drawn again with at least twice the capacity. A long flight therefore compiles only a few times,
     and no camera is refused. Models of equal shapes share compiled programs.
 
     Examples:
@@ -153,11 +142,17 @@ class Renderer:
         self._has_geometry = has_geometry
         cameras_of_model = [] if model.origin is None else model.origin.cameras
         self._planned = evenly_chosen(cameras_of_model, PLANNED_CAMERAS)
-        self.capacities: dict[Size, int] = dict(capacities or {})
-        """Capacities for (splat, tile) pairs by image size, (width, height)."""
+        self._room = TileRoom(dict(capacities or {}))
+        by_size: dict[Size, list[Camera]] = {}
         for camera in checked_cameras(cameras):
-            size = camera.width, camera.height
-            self.capacities[size] = max(self.capacities.get(size, 0), capacity_for(self._num_pairs(camera)))
+            by_size.setdefault((camera.width, camera.height), []).append(camera)
+        for size, alike in by_size.items():
+            self._plan(size, alike)
+
+    @property
+    def capacities(self) -> Mapping[Size, int]:
+        """Capacities for (splat, tile) pairs by image size, (width, height)."""
+        return self._room.capacities
 
     def __repr__(self) -> str:
         sizes = ", ".join(f"{width}×{height}" for width, height in self.capacities) or "no size yet"
@@ -167,19 +162,21 @@ class Renderer:
         """Render the view of a camera; never an overflow."""
         check_camera(camera)
         size = camera.width, camera.height
-        if size not in self.capacities:
-            cameras = [camera, *(resize_camera(planned, *size) for planned in self._planned)]
-            # A first view may see next to nothing: in another one all Gaussians may be visible, in a tile or more each.
-            pairs = max(self._gaussians.num, *map(self._num_pairs, cameras))
-            self.capacities[size] = capacity_for(pairs, FIRST_ROOM)
+        if size not in self._room.capacities:
+            self._plan(size, [camera])
         output, needed = self._draw(camera)
         while bool(output.overflow):
-            self.capacities[size] = max(capacity_for(int(needed)), GROWTH * self.capacities[size])
+            # A camera that approaches will list more yet.
+            self._room.enlarge(size, 2 * int(needed))
             output, needed = self._draw(camera)
         return output
 
-    def _num_pairs(self, camera: Camera) -> int:
-        return pairs_of_view(self._gaussians, camera, self._appearance, self._settings, self._num_live)
+    def _plan(self, size: Size, cameras: Sequence[Camera]) -> None:
+        """Plan the capacity of an image size for cameras of this size and for the model's own."""
+        cameras = [*cameras, *(resize_camera(planned, *size) for planned in self._planned)]
+        pairs = most_pairs(self._gaussians, cameras, self._appearance, self._settings, self._num_live)
+        # A first view may see next to nothing: in another one all Gaussians may be visible, in a tile or more each.
+        self._room.plan(size, max(self._gaussians.num, pairs))
 
     def _draw(self, camera: Camera) -> tuple[RenderOutput, Array]:
         settings = dataclasses.replace(self._settings, capacity=self.capacities[camera.width, camera.height])

@@ -75,8 +75,8 @@ def training_step(
     appearance = stage.appearance if stage.appearance.texture is None else stage.appearance.with_textures(textures)
     render = a2tg_jax.plan_render(gaussians, camera, textures, settings=a2tg_jax.RenderSettings(**settings))
     model = Model(gaussians, appearance, num_live=jnp.asarray(num, jnp.int32))
-    clock = stage.clock()
-    step = StepSettings(render, "black", tuple(times is None for times in clock.times))
+    clock = stage.clock(1)
+    step = StepSettings(render, "black", tuple(left is None for left in clock.num_left))
     stack = lambda matrix: np.repeat(np.asarray(matrix, np.float32)[None], NUM_PHOTOGRAPHS, axis=0)  # noqa: E731
     noise = np.random.default_rng(1).integers(0, 256, (NUM_PHOTOGRAPHS, height, width, 3), dtype=np.uint8)
     photographs = Photographs(stack(camera.viewmat), stack(camera.K), noise, None)

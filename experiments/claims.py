@@ -1,13 +1,14 @@
 """The registered comparison of `bytewise`: its endpoints, and exploration (E6 of PROTOCOL.md)."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from findings import Row
 from lab import tables
 from lab.cli import Experiment, Lab
-from lab.grid import Grid, read_grid
+from lab.grid import Grid, read_grid, seconds_of
+from lab.jobs import Record
 from lab.markdown import table
 from lab.statistics import Comparison, compare, holm
 from lab.tables import EQUAL_TIME, Result
@@ -126,18 +127,19 @@ def scenes_table(results: Sequence[Result], others: Sequence[str]) -> str:
     return table(header, lines)
 
 
-def times_text(results: Sequence[Result]) -> str:
-    """Return how long the runs of equal time took, compared with `bytewise`."""
+def times_text(results: Sequence[Result], records: Mapping[str, Record]) -> str:
+    """Return how long the trainings of equal time took, compared with `bytewise`; `records` have all their stages."""
     ratios = []
     for _, block in tables.grouped(results, lambda result: result.run.cell):
-        times = {result.label: result.record.get("training_seconds") for result in block}
-        pair = times.get(STRONGEST + EQUAL_TIME), times.get(BYTEWISE)
-        if None not in pair:
-            ratios.append(pair[0] / pair[1])
+        times = {result.label: seconds_of(result.run.job, records) for result in block}
+        strongest = times.get(STRONGEST + EQUAL_TIME)
+        bytewise = times.get(BYTEWISE)
+        if strongest is not None and bytewise is not None:
+            ratios.append(strongest / bytewise)
     if not ratios:
         return ""
     return (
-        f"The last stages of equal time took {min(ratios):.2f} to {max(ratios):.2f} times as long as "
+        f"The trainings of equal time took {min(ratios):.2f} to {max(ratios):.2f} times as long as "
         f"`bytewise`'s, {np.mean(ratios):.2f} on average, in {len(ratios)} pairs.\n"
     )
 
@@ -153,7 +155,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     )
     rows = [row_of(dense, budget, other) for budget in BUDGETS for other in OTHERS]
     rows += [row_of(few, budget, other, "few views") for budget in BUDGETS for other in OTHERS]
-    lab.write(EXPERIMENT.name, f"# {grid.title}\n\n{endpoints_table(dense, unseen)}\n{times_text(dense)}")
+    lab.write(EXPERIMENT.name, f"# {grid.title}\n\n{endpoints_table(dense, unseen)}\n{times_text(dense, lab.records)}")
     lab.write("exploration", f"# All comparisons\n\n{exploration_table(rows)}\n{scenes_table(results, list(OTHERS))}")
 
 

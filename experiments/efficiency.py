@@ -72,11 +72,10 @@ def _times(lab: Lab, result: tables.Result, model: a2tg.Model) -> dict:
     job = result.run.job
     rounds = SMOKE_ROUNDS if lab.is_smoke else TIMED_ROUNDS
     scene = lab.folders.load_scene(job)
-    jobs = [dataclasses.replace(job, stage=stage) for stage in range(job.stage + 1)]
     return {
         "fps": max(a2tg.evaluate(scene.test, model).frames_per_second for _ in range(rounds)),
-        "ms_per_step": [1e3 * _seconds_per_step(lab, one, scene) for one in jobs],
-        "iterations": [one.iterations for one in jobs],
+        "ms_per_step": [1e3 * _seconds_per_step(lab, one, scene) for one in job.chain],
+        "iterations": job.all_iterations,
         "machine": jax.devices()[0].device_kind,
     }
 

@@ -28,8 +28,8 @@ from lab.grid_file import SUFFIX
 from lab.standard import STANDARD, file_experiment
 
 from a2tg_jax import configure_cpu
+from a2tg_jax.base.text import did_you_mean
 from a2tg_jax.host import signals
-from a2tg_jax.host.text import did_you_mean
 
 MODULES = ("choose_plain", "findings", "claims", "ablation", "resolution_shares", "efficiency")
 """Modules of this folder that hold an EXPERIMENT; the one that measures time comes last."""

@@ -16,7 +16,7 @@ import jax
 import psutil
 import pytest
 
-from a2tg_jax.host.operating_system import trim_heap
+from a2tg_jax.base.operating_system import trim_heap
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")

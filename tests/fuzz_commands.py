@@ -20,11 +20,10 @@ def write_runs(folder: Path) -> None:
     from run_folders import create_run
     from small_models import some_model, with_row
 
-    from a2tg_jax import save_model
+    from a2tg_jax import History, save_model
     from a2tg_jax.results.folder import write_json
     from a2tg_jax.results.history import write_history
     from a2tg_jax.results.record import RunRecord, SceneSource, chosen_system, write_record
-    from a2tg_jax.training import History
 
     history = History.empty()
     for iteration in range(1, 6):

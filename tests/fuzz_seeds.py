@@ -23,16 +23,23 @@ from test_others import OTHERS
 from test_spz import SAFE_ORBIT, declaring, glb_of, gltf_of, with_records
 
 import a2tg_jax as a2tg
-from a2tg_jax import save_compact, save_gltf, save_model, save_ply
+from a2tg_jax import (
+    BBSplat,
+    Bytewise,
+    History,
+    Model,
+    SuperGaussians,
+    save_checkpoint,
+    save_compact,
+    save_gltf,
+    save_model,
+    save_ply,
+)
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.io.ply import ATTRIBUTES
-from a2tg_jax.model import Model
 from a2tg_jax.results.folder import RunFolder, write_json as write_run_json
 from a2tg_jax.results.history import write_history
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record
-from a2tg_jax.systems.baselines import BBSplat, SuperGaussians
-from a2tg_jax.systems.bytewise import Bytewise
-from a2tg_jax.training import History, save_checkpoint
 
 SYSTEMS = {
     "a2tg": lambda: a2tg.A2tg(sh_degree=0),

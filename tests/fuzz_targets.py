@@ -7,8 +7,8 @@ import numpy as np
 from fuzz_commands import run_commands
 
 import a2tg_jax as a2tg
+from a2tg_jax import load_checkpoint, load_scene
 from a2tg_jax.data.decoding import read_pixels
-from a2tg_jax.data.load import load_scene
 from a2tg_jax.data.ply import read_ply_points
 from a2tg_jax.measure import metrics
 from a2tg_jax.results.figures import curves_figure
@@ -16,7 +16,6 @@ from a2tg_jax.results.folder import RunFolder, check_free, open_run
 from a2tg_jax.results.history import read_history
 from a2tg_jax.results.info import describe_run
 from a2tg_jax.results.record import read_record
-from a2tg_jax.training import load_checkpoint
 from a2tg_jax.training.step import initial_state
 
 

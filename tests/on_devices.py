@@ -18,12 +18,10 @@ from scenes_random import fisheye
 from test_shared import Own
 
 import a2tg_jax as a2tg
-from a2tg_jax.densify.splitting import SplitByGradient
-from a2tg_jax.events import Change, HostEvent, StepEvent
-from a2tg_jax.io.config_json import changed_config
+from a2tg_jax import Change, Gaussians2dMcmc, HostEvent, Session, SplitByGradient, StepEvent, fit_stage
+from a2tg_jax.core.config_json import changed_config
 from a2tg_jax.parallel import whole
-from a2tg_jax.systems.baselines import Gaussians2dMcmc
-from a2tg_jax.training import Session, fit_stage, loop
+from a2tg_jax.training import loop
 from a2tg_jax.training.batches import PhotoStore
 from a2tg_jax.training.cost import stage_bytes
 from a2tg_jax.training.loop import StageRun
@@ -176,7 +174,7 @@ def assert_divided(state):
 class Reverse(HostEvent):
     """A custom event that reverses the order of the rows, by JAX and by NumPy."""
 
-    def iterations(self, num_iterations):
+    def times(self, num_iterations):
         return (2,)
 
     def apply(self, due, model, moments, state):

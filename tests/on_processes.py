@@ -24,10 +24,10 @@ from jax.experimental import multihost_utils
 from on_devices import attempted, close, plain, scene, system
 
 import a2tg_jax as a2tg
+from a2tg_jax import Gaussians2dMcmc, Session
 from a2tg_jax.cli.processes import ProcessPlace, joined
 from a2tg_jax.parallel import whole
-from a2tg_jax.systems.baselines import Gaussians2dMcmc
-from a2tg_jax.training import Session, loop
+from a2tg_jax.training import loop
 from a2tg_jax.training.batches import PhotoStore
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.step import attempt

@@ -13,16 +13,24 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax import load_compact, load_gltf, load_model, save_compact
-from a2tg_jax.appearance import Appearance, Bands, Exponents, Texture
+from a2tg_jax import (
+    Appearance,
+    Bands,
+    Camera,
+    Exponents,
+    Gaussians,
+    Model,
+    Origin,
+    Similarity,
+    Texture,
+    load_compact,
+    load_gltf,
+    load_model,
+    save_compact,
+    textures_from_arrays,
+)
 from a2tg_jax.appearance.parts import bands_of_dense, log_exponents_of
-from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.gaussians import Gaussians
-from a2tg_jax.core.origin import Origin
-from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.io.web_scene import encode_web_scene
-from a2tg_jax.model import Model
-from a2tg_jax.texture import textures_from_arrays
 
 NUM = 10
 BACKGROUND = 0.25, 0.5, 0.75

@@ -6,13 +6,10 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.core.cameras import Camera
-from a2tg_jax.measure.evaluation import Evaluation, ViewMetrics
+from a2tg_jax import A2tg, Camera, Evaluation, History, ViewMetrics
 from a2tg_jax.results.folder import RunFolder, check_free
 from a2tg_jax.results.record import RunRecord, SceneSource
 from a2tg_jax.results.report import ModelResult, RunResult
-from a2tg_jax.systems.a2tg import A2tg
-from a2tg_jax.training import History
 
 RECORD = RunRecord(SceneSource("/scenes/a b", downscale=2), "a2tg", A2tg.preset("quick"), ("gaussians-2d-mcmc",))
 NAMES = ["a2tg-gaussians", "a2tg-textures", "gaussians-2d-mcmc-continued"]

@@ -5,12 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import a2tg_jax as a2tg
-from a2tg_jax.appearance import allocate_appearance
-from a2tg_jax.core.gaussians import init_from_points
-from a2tg_jax.core.origin import Origin
-from a2tg_jax.events import Now
-from a2tg_jax.model import Model
-from a2tg_jax.training import Checkpoint, History
+from a2tg_jax import Checkpoint, History, Model, Now, Origin, allocate_appearance, init_from_points
 from a2tg_jax.training.checkpoint import COLUMNS, TERM
 from a2tg_jax.training.step import initial_state
 
@@ -51,12 +46,12 @@ def some_checkpoint(system):
     return Checkpoint(system, len(stages) - 1, initial_state(stages[-1], live), history)
 
 
-def some_now(iteration, num_iterations, times=None, *, num_keys=1, scene_scale=1.0):
+def some_now(iteration, num_iterations, num_left=None, *, num_keys=1, scene_scale=1.0):
     """What an event inside the step is given."""
     numbers = (jnp.asarray(number, jnp.int32) for number in (iteration, num_iterations))
     keys = jax.random.split(jax.random.key(0), num_keys)
     done, length = numbers
-    return Now(keys, done, jnp.float32(1e-4), length, jnp.float32(scene_scale), times)
+    return Now(keys, done, jnp.float32(1e-4), length, jnp.float32(scene_scale), num_left)
 
 
 def write_random_squeeze(path):

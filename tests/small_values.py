@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from a2tg_jax.core.gaussians import Gaussians
-from a2tg_jax.core.similarity import Similarity
+from a2tg_jax import Gaussians, Similarity
 
 
 def some_gaussians(num: int = 7, seed: int = 0) -> Gaussians:

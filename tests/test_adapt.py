@@ -11,17 +11,29 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from a2tg_jax.adapt import Upscale, most_textures, next_sizes, reallocate, select
-from a2tg_jax.appearance import Appearance, Texture, allocate_appearance
+from a2tg_jax import (
+    A2tg,
+    Appearance,
+    Due,
+    GradientStatistics,
+    Model,
+    Texture,
+    Upscale,
+    adam_init,
+    allocate_appearance,
+    allocate_textures,
+    combine,
+    init_from_points,
+    next_sizes,
+    partition,
+    reallocate,
+    select,
+    texture_arrays,
+    textures_from_arrays,
+)
+from a2tg_jax.adapt import most_textures
 from a2tg_jax.core.budget import event_budget
-from a2tg_jax.core.gaussians import init_from_points
-from a2tg_jax.core.optim import adam_init
-from a2tg_jax.core.pytree import combine, partition
 from a2tg_jax.core.table import Shape, plan_places
-from a2tg_jax.events import Due, GradientStatistics
-from a2tg_jax.model import Model
-from a2tg_jax.systems.a2tg import A2tg
-from a2tg_jax.texture import allocate_textures, texture_arrays, textures_from_arrays
 
 ROUND, WIDE, TALL, WIDE_BUT_LARGE = (0.1, 0.1), (0.05, 0.009), (0.009, 0.05), (0.5, 0.02)
 PAPER = {"k_a": 4.0, "k_s": 0.01, "cap": 4}
@@ -319,7 +331,7 @@ def test_padding_is_neutral_and_has_no_moments():
     ],
 )
 def test_impossible_choices_are_refused_before_training(event, message):
-    assert Upscale(at=(0.1, 0.2, 0.9)).iterations(3) == (1, 3), "upscalings that fall together are one"
+    assert Upscale(at=(0.1, 0.2, 0.9)).times(3) == (1, 3), "upscalings that fall together are one"
     stage = A2tg.preset("smoke").stages()[1]
     with pytest.raises(ValueError, match=message):
         dataclasses.replace(stage, events=(event,)).check()

@@ -7,13 +7,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from a2tg_jax import Gaussians2dMcmc, RenderSettings, align_poses, color_fit, evaluate, fit, synthetic_scene
+from a2tg_jax import (
+    Corrections,
+    Exposure,
+    Gaussians2dMcmc,
+    Mcmc,
+    RenderSettings,
+    align_poses,
+    color_fit,
+    evaluate,
+    fit,
+    synthetic_scene,
+)
 from a2tg_jax.cli.main import main
 from a2tg_jax.core.cameras import moved_viewmat
-from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.measure import alignment
-from a2tg_jax.training.corrections import Exposure
-from a2tg_jax.training.options import Corrections
 
 TWIST = np.array([0.018, -0.012, 0.009, 0.012, -0.009, 0.015])
 

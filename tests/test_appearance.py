@@ -10,24 +10,27 @@ from scenes_random import as_camera, as_gaussians, draw_scene
 from test_oracle import FACING, FOCAL, hand_scene
 
 import a2tg_jax as a2tg
-from a2tg_jax import Bands, Exponents, Model, Texture, TextureOptions, load_model, render_appearance, save_model
-from a2tg_jax.appearance import (
+from a2tg_jax import (
     Appearance,
-    Billboards,
-    MovableKernels,
+    Bands,
+    Exponents,
+    Model,
+    Texture,
+    TextureOptions,
     allocate_appearance,
-    appearance_for,
-    count_floats,
-    in_words,
+    allocate_textures,
+    combine,
+    load_model,
+    partition,
     project_appearance,
-    template_of,
+    render_appearance,
+    save_model,
 )
+from a2tg_jax.appearance import Billboards, MovableKernels, appearance_for, count_floats, in_words, template_of
 from a2tg_jax.appearance.base import clear_rows
 from a2tg_jax.appearance.files import arrays_of
 from a2tg_jax.core.gaussians import logit, share
-from a2tg_jax.core.pytree import combine, partition
 from a2tg_jax.events import gather_rows
-from a2tg_jax.texture import allocate_textures
 
 KEY = jax.random.key(0)
 TEXTURED = Appearance(texture=Texture(start=(2, 3)))

@@ -12,8 +12,15 @@ from scipy import integrate
 from small_values import some_gaussians
 
 from a2tg_jax import (
+    A2tg,
+    Appearance,
+    Bands,
     Camera,
+    Exponents,
+    Gaussians,
     Model,
+    Origin,
+    Texture,
     TextureOptions,
     load_gltf,
     load_splats,
@@ -22,11 +29,9 @@ from a2tg_jax import (
     save_splats,
     textures_from_arrays,
 )
-from a2tg_jax.appearance import Appearance, Bands, Exponents, Texture
 from a2tg_jax.appearance.parts import bands_of_dense, curves_of, falloff_of, nearest_gaussians, shapes_of
 from a2tg_jax.cli.main import main
-from a2tg_jax.core.gaussians import Gaussians
-from a2tg_jax.core.origin import WHITE, Origin
+from a2tg_jax.core.origin import WHITE
 from a2tg_jax.data.load import SceneSource
 from a2tg_jax.finish import baking
 from a2tg_jax.finish.baking import (
@@ -43,7 +48,6 @@ from a2tg_jax.finish.baking import (
 from a2tg_jax.finish.shrinking import fewest_texels
 from a2tg_jax.results import conversion
 from a2tg_jax.results.record import RunRecord, write_record
-from a2tg_jax.systems.a2tg import A2tg
 
 CAMERA = Camera(jnp.eye(4).at[2, 3].set(4), jnp.asarray([[60.0, 0, 24], [0, 60, 18], [0, 0, 1]]), 48, 36)
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from a2tg_jax.core.bilinear import TextureRegion, corners_of, follow, interpolate
+from a2tg_jax import TextureRegion
+from a2tg_jax.core.bilinear import corners_of, follow, interpolate
 
 SIZES = [(1, 1), (1, 8), (8, 2), (5, 3), (16, 16)]
 FIRST = 7

@@ -12,18 +12,24 @@ import pytest
 from small_models import some_now
 
 import a2tg_jax as a2tg
-from a2tg_jax.adapt import Upscale
-from a2tg_jax.appearance import Appearance, Texture, allocate_appearance
+from a2tg_jax import (
+    Appearance,
+    Due,
+    FillingDensity,
+    FillingMcmc,
+    GradientStatistics,
+    Model,
+    Texture,
+    Upscale,
+    adam_init,
+    allocate_appearance,
+    init_from_points,
+    partition,
+)
 from a2tg_jax.cli import main as cli
 from a2tg_jax.core.budget import bytes_per_gaussian, megabytes_of, number_to_reach
-from a2tg_jax.core.gaussians import init_from_points, logit
-from a2tg_jax.core.optim import adam_init
-from a2tg_jax.core.pytree import partition
-from a2tg_jax.densify.clone_split import FillingDensity
-from a2tg_jax.events import Due, GradientStatistics
-from a2tg_jax.io.config_json import changed_config, config_from_dict, config_to_dict
-from a2tg_jax.mcmc import FillingMcmc
-from a2tg_jax.model import Model
+from a2tg_jax.core.config_json import changed_config, config_from_dict, config_to_dict
+from a2tg_jax.core.gaussians import logit
 from a2tg_jax.training.fitting import warn_of_budget
 from a2tg_jax.training.registry import SYSTEMS, system_from_dict, system_to_dict
 from a2tg_jax.training.start import check_start
@@ -113,15 +119,14 @@ def test_monte_carlo_growth_leaves_the_cap(x64, dtype, num_iterations, count):
     event, moments = FillingMcmc(300), adam_init(partition(model)[0])
     times = event.times(num_iterations)
     apply = jax.jit(
-        lambda iteration, *rest: event.apply(some_now(iteration, num_iterations, times, num_keys=2), *rest, ())
+        lambda iteration, left, *rest: event.apply(some_now(iteration, num_iterations, left, num_keys=2), *rest, ())
     )
     counts = [4]
-    for iteration in range(1, num_iterations + 1):
-        if times.is_due(iteration):
-            model, moments, *_ = apply(jnp.asarray(iteration, jnp.int32), model, moments)
-            counts.append(int(model.num_live))
+    for left, iteration in zip(range(count, 0, -1), times, strict=True):
+        model, moments, *_ = apply(*map(jnp.int32, (iteration, left)), model, moments)
+        counts.append(int(model.num_live))
     factors = np.divide(counts[1:], counts[:-1])
-    assert len(factors) == times.num_times == count and counts[-1] == 300
+    assert len(factors) == count and counts[-1] == 300
     assert abs(np.log(factors[1:]) - np.log(75) / count).max() < 0.2, "by one factor, rounded up"
     assert model.gaussians.means.dtype == dtype
 
@@ -183,16 +188,15 @@ def test_density_control_reaches_its_cap_whatever_is_pruned(faint):
     num, num_live, num_iterations = 100, 30, 100
     event = FillingDensity(num, threshold=0.5)
     times = event.times(num_iterations)
-    plan = jax.jit(lambda iteration, *seen: event.plan(some_now(iteration, num_iterations, times), *seen))
+    plan = jax.jit(lambda iteration, left, *seen: event.plan(some_now(iteration, num_iterations, left), *seen))
     rng = np.random.default_rng(1)
-    due = [iteration for iteration in range(1, num_iterations) if times.is_due(iteration)]
-    assert len(due) == times.num_times == 4
-    for left, iteration in zip(range(len(due), 0, -1), due, strict=True):
+    assert list(times) == [10, 20, 30, 40]
+    for left, iteration in zip((4, 3, 2, 1), times, strict=True):
         opacities = np.where(rng.uniform(size=num) < faint, 1, 10) * rng.uniform(0.01, 0.04, num) + 0.01
         opacities[0] = 0.9
         model = random_model(iteration, num, num_live, opacities)
         gradients = np.round(rng.exponential(size=num), 1).astype(np.float32)
-        edit, num_refused = plan(jnp.asarray(iteration, jnp.int32), model, jnp.asarray(gradients))
+        edit, num_refused = plan(*map(jnp.int32, (iteration, left)), model, jnp.asarray(gradients))
         kept, doubled = (np.flatnonzero(mask) for mask in (edit.is_kept, edit.is_cloned | edit.is_split))
         wanted = int(number_to_reach(jnp.asarray(num_live, jnp.int32), num, left))
         opaque = np.flatnonzero((opacities >= 0.05) & (np.arange(num) < num_live))

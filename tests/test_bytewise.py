@@ -4,24 +4,31 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled_programs import compiled_programs
 from small_values import some_gaussians
 
 import a2tg_jax as a2tg
-from a2tg_jax import Model
-from a2tg_jax.adapt import Upscale
-from a2tg_jax.appearance import Appearance, Bands, Exponents, Texture, allocate_appearance
+from a2tg_jax import (
+    AdaptDegrees,
+    Appearance,
+    Bands,
+    Bytewise,
+    Exponents,
+    HostEvent,
+    LimitExponents,
+    LossConfig,
+    Model,
+    Texture,
+    Upscale,
+    allocate_appearance,
+    load_checkpoint,
+    save_checkpoint,
+)
 from a2tg_jax.appearance.files import arrays_of
 from a2tg_jax.appearance.parts import log_exponents_of
 from a2tg_jax.core.budget import bytes_of, event_budget
-from a2tg_jax.core.pytree import num_compiled
-from a2tg_jax.densify.view_dependence import AdaptDegrees
-from a2tg_jax.events import HostEvent
-from a2tg_jax.io.config_json import changed_config
+from a2tg_jax.core.config_json import changed_config
 from a2tg_jax.results.record import compared_system
-from a2tg_jax.systems.bytewise import Bytewise
-from a2tg_jax.systems.two_stages import LimitExponents
-from a2tg_jax.training import LossConfig
-from a2tg_jax.training.checkpoint import load_checkpoint, save_checkpoint
 from a2tg_jax.training.start import initial_model, padded
 from a2tg_jax.training.step import jitted_step
 
@@ -85,10 +92,10 @@ def test_details_have_their_room_before_they_come(scene, before_details, monkeyp
     system, first = before_details
 
     def details():
-        before = num_compiled(jitted_step())
-        result = a2tg.fit_stage(scene, system, 1, first, progress=False)
+        with compiled_programs("train_step") as programs:
+            result = a2tg.fit_stage(scene, system, 1, first, progress=False)
         assert result.history.megabytes.max() <= 0.04
-        return result.model, num_compiled(jitted_step()) - before - result.num_regrown
+        return result.model, len(programs) - result.num_regrown
 
     jitted_step().clear_cache()
     model, num_steps = details()
@@ -116,9 +123,9 @@ def test_a_resumed_stage_has_its_room_again(scene, before_details, tmp_path):
 
     whole = a2tg.fit_stage(scene, system, 1, first, progress=False, on_checkpoint=keep, checkpoint_every=4)
     for stop in stops[:2]:
-        before = num_compiled(jitted_step())
-        rest = a2tg.fit_stage(scene, system, 1, resume=stop, progress=False)
-        assert num_compiled(jitted_step()) - before - rest.num_regrown <= 1, stop.iteration
+        with compiled_programs("train_step") as programs:
+            rest = a2tg.fit_stage(scene, system, 1, resume=stop, progress=False)
+        assert len(programs) - rest.num_regrown <= 1, stop.iteration
         assert_same(rest.model, whole.model)
 
 

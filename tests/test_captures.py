@@ -24,8 +24,8 @@ from test_data_transforms import (
     write_ply,
 )
 
+from a2tg_jax import load_scene
 from a2tg_jax.data import decoding
-from a2tg_jax.data.load import load_scene
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*sparse points; starts from")
 COUNT = 4

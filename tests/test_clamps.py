@@ -10,20 +10,22 @@ from scenes_random import quick_then_long
 from small_values import some_gaussians
 
 import a2tg_jax as a2tg
-from a2tg_jax.appearance import (
+from a2tg_jax import (
     Appearance,
-    Billboards,
     Exponents,
     Texture,
     TextureOptions,
+    adam_init,
+    adam_update,
     allocate_appearance,
+    combine,
+    partition,
     project_appearance,
 )
+from a2tg_jax.appearance import Billboards
 from a2tg_jax.appearance.parts import LARGEST_LOG_EXPONENT
 from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.core.numerics import at_least, within
-from a2tg_jax.core.optim import adam_init, adam_update
-from a2tg_jax.core.pytree import combine, partition
 from a2tg_jax.training.start import start_colors
 
 UNIT = TextureOptions(rgb="unit", alpha="global-maximum")

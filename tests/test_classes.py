@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled_programs import compiled_programs
 from lab.fingerprint import fingerprint
 
 import a2tg_jax as a2tg
-from a2tg_jax.core.pytree import beside, num_compiled
-from a2tg_jax.events import Change
-from a2tg_jax.mcmc import Noise
+from a2tg_jax import Change, Noise
+from a2tg_jax.core.pytree import beside
 from a2tg_jax.results.plan import plan_run
 
 
@@ -27,12 +27,16 @@ def appearance_of(index: int) -> type:
 
 def test_no_class_runs_the_program_of_another():
     """Under `register_dataclass`, one in five subclasses does."""
-    function = jax.jit(lambda appearance, rho: appearance.falloff((), rho))
+
+    @jax.jit
+    def falloff(appearance, rho):
+        return appearance.falloff((), rho)
+
     made = [appearance_of(index)() for index in range(60)]
-    assert [float(function(appearance, jnp.float32(0))) for appearance in made] == [1 + index for index in range(60)]
-    assert num_compiled(function) == 60
-    assert [float(function(appearance, jnp.float32(0))) for appearance in made] == [1 + index for index in range(60)]
-    assert num_compiled(function) == 60
+    with compiled_programs("falloff") as programs:
+        for _ in range(2):
+            assert [float(falloff(appearance, jnp.float32(0))) for appearance in made] == list(range(1, 61))
+    assert len(programs) == 60
 
 
 def test_fields_are_arrays_static_or_beside():

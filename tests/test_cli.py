@@ -19,23 +19,22 @@ import pytest
 from PIL import Image
 from run_folders import create_run
 
+from a2tg_jax import find_system, load_model, load_ply, save_model
+from a2tg_jax.base.regular_files import sha256_of
 from a2tg_jax.cli import doctor, main as cli
 from a2tg_jax.cli.train import Train, train_defaults
 from a2tg_jax.data.load import SceneSource
-from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.host import startup
-from a2tg_jax.host.regular_files import sha256_of
 from a2tg_jax.io.compact import unframed
-from a2tg_jax.io.model_file import load_model, save_model
-from a2tg_jax.io.ply import load_ply
-from a2tg_jax.results import finishing, run_training, viewing
+from a2tg_jax.results import finishing, run_training, stage_training, viewing
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.frames import LIST
 from a2tg_jax.results.history import read_history
 from a2tg_jax.results.model_source import open_source
 from a2tg_jax.results.record import read_record, write_record
 from a2tg_jax.results.viewing import routes_of
-from a2tg_jax.training import SYSTEMS, find_system
+from a2tg_jax.scene import origin_of_scene
+from a2tg_jax.training import SYSTEMS
 
 TINY = [
     *("--system", "a2tg", "--downscale", "5", "--stage1-iterations", "20", "--stage2-iterations", "20", "--baseline"),
@@ -53,7 +52,7 @@ def tiny_run(tmp_path_factory):
     """A run interrupted after the first checkpoint of its textures and resumed, with both exit codes."""
     out = tmp_path_factory.mktemp("cli") / "run"
     arguments = ["train", "synthetic", "--out", str(out), *TENSORBOARD]
-    save = run_training.save_checkpoint
+    save = stage_training.save_checkpoint
 
     def save_and_interrupt(path, checkpoint):
         save(path, checkpoint)
@@ -62,7 +61,7 @@ def tiny_run(tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cli, "configure_cpu", lambda: None)
-        patch.setattr(run_training, "save_checkpoint", save_and_interrupt)
+        patch.setattr(stage_training, "save_checkpoint", save_and_interrupt)
         interrupted = cli.main([*arguments, *TINY])
         patch.undo()
         patch.setattr(cli, "configure_cpu", lambda: None)

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from a2tg_jax.cli import main as cli
-from a2tg_jax.results import run_training
+from a2tg_jax.results import stage_training
 from a2tg_jax.results.folder import RunFolder
 
 pytestmark = pytest.mark.long
@@ -25,7 +25,7 @@ def folder(tmp_path_factory):
     """A folder with a system in my_toy.py, and a run that was interrupted at its first checkpoint and resumed."""
     folder = tmp_path_factory.mktemp("mine")
     shutil.copy(TOY, folder / "my_toy.py")
-    save = run_training.save_checkpoint
+    save = stage_training.save_checkpoint
 
     def save_and_interrupt(path, checkpoint):
         save(path, checkpoint)
@@ -36,7 +36,7 @@ def folder(tmp_path_factory):
         patch.setattr(sys, "path", list(sys.path))
         patch.setattr(cli, "configure_cpu", lambda: None)
         with pytest.MonkeyPatch.context() as interrupting:
-            interrupting.setattr(run_training, "save_checkpoint", save_and_interrupt)
+            interrupting.setattr(stage_training, "save_checkpoint", save_and_interrupt)
             sizes = ["--downscale", "6", "--initial-gaussians", "60", "--stage1-iterations", "10"]
             codes = [cli.main(["train", "synthetic", *MINE, "--out", "run", *sizes, "--contrast-weight", "0.2"])]
         shutil.copytree("run", "interrupted")
@@ -88,7 +88,7 @@ def test_numbers_edited_between_two_attempts_are_refused(inside, tmp_path, capsy
     copy = RunFolder(shutil.copytree(inside.path, tmp_path / "copy"))
     copy.record.write_text(copy.record.read_text().replace("contrast_weight = 0.2", "contrast_weight = 0.3"))
     assert cli.main(["train", "--out", str(copy.path), "--resume"]) == 2
-    assert "Toy-rings.npz was made with another contrast_weight than in run.toml" in capsys.readouterr().err
+    assert "Toy-rings.npz was made with another contrast_weight than the run has now" in capsys.readouterr().err
     stopped = RunFolder(shutil.copytree("interrupted", tmp_path / "stopped"))
     shutil.copy(copy.record, stopped.record)
     assert cli.main(["train", "--out", str(stopped.path), "--resume"]) == 2

@@ -16,23 +16,28 @@ from scenes_random import as_camera, as_gaussians, draw_scene
 from scipy.spatial import cKDTree
 from small_values import some_gaussians
 
-from a2tg_jax.appearance import (
+from a2tg_jax import (
     Appearance,
     Bands,
-    Billboards,
+    Camera,
+    CompactChoices,
     Exponents,
-    MovableKernels,
+    Gaussians,
+    Model,
+    Origin,
+    RenderSettings,
     Texture,
     TextureOptions,
     allocate_appearance,
-    in_words,
-    template_of,
+    concatenate,
+    load_compact,
+    save_compact,
+    textures_from_arrays,
 )
+from a2tg_jax.appearance import Billboards, MovableKernels, in_words, template_of
 from a2tg_jax.appearance.files import arrays_of
 from a2tg_jax.appearance.parts import bands_of_dense, log_exponents_of, shapes_of
-from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.gaussians import Gaussians, rotation_matrices
-from a2tg_jax.core.origin import Origin
+from a2tg_jax.core.gaussians import rotation_matrices
 from a2tg_jax.io.columns import (
     CODERS,
     AxisSteps,
@@ -52,24 +57,9 @@ from a2tg_jax.io.columns import (
     with_green,
     with_w,
 )
-from a2tg_jax.io.compact import (
-    GROUPS,
-    HEAD,
-    MAGIC,
-    VERSION,
-    CompactChoices,
-    decode_model,
-    encode_model,
-    framed,
-    load_compact,
-    save_compact,
-    unframed,
-)
+from a2tg_jax.io.compact import GROUPS, HEAD, MAGIC, VERSION, decode_model, encode_model, framed, unframed
 from a2tg_jax.io.model_rows import nearest_half_turn
 from a2tg_jax.io.web_scene import CHOICES, encode_web_scene, importance
-from a2tg_jax.model import Model, concatenate
-from a2tg_jax.render import RenderSettings
-from a2tg_jax.texture import textures_from_arrays
 
 EXACT = CompactChoices().keeping(dict.fromkeys(GROUPS, "float32"))
 SCENE = draw_scene(4)

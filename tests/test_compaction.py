@@ -7,26 +7,27 @@ import numpy as np
 import pytest
 from small_values import some_gaussians
 
-from a2tg_jax.cli import main as cli
-from a2tg_jax.core.gaussians import init_from_points
-from a2tg_jax.data.scene import origin_of_scene
-from a2tg_jax.data.synthetic import synthetic_scene
-from a2tg_jax.finish import compaction
-from a2tg_jax.finish.compaction import (
+from a2tg_jax import (
+    CompactChoices,
+    Model,
     Trial,
-    best_within,
+    evaluate,
+    init_from_points,
+    load_compact,
     loss_beside_renders,
     loss_on_views,
     measure_choices,
+    save_model,
     smallest_within,
-    try_choices,
+    synthetic_scene,
 )
-from a2tg_jax.host.text import in_bytes
-from a2tg_jax.io.compact import CompactChoices, encode_model, load_compact
-from a2tg_jax.io.model_file import save_model
-from a2tg_jax.measure.evaluation import evaluate
-from a2tg_jax.model import Model
+from a2tg_jax.base.text import in_bytes
+from a2tg_jax.cli import main as cli
+from a2tg_jax.finish import compaction
+from a2tg_jax.finish.compaction import best_within, try_choices
+from a2tg_jax.io.compact import encode_model
 from a2tg_jax.results import compression
+from a2tg_jax.scene import origin_of_scene
 
 SCENE = synthetic_scene(num_views=6, width=24, height=18, num_points=300)
 SMALL = {"means": (4, 8, 16), "opacities": (2, 10), "sh_0": (3, 8), "sh_rest": (3, 8), "texels": (3, 8)}

@@ -9,22 +9,29 @@ import pytest
 from run_folders import create_run
 from test_cli import fails
 
-from a2tg_jax.appearance import Appearance, Texture
+from a2tg_jax import (
+    A2tg,
+    Appearance,
+    CompactChoices,
+    DivergedError,
+    Mcmc,
+    Texture,
+    Trial,
+    allocate_textures,
+    evaluate,
+    load_compact,
+    load_model,
+    save_model,
+)
 from a2tg_jax.cli import main as cli
 from a2tg_jax.data.load import SceneSource
-from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.finish import tuning
-from a2tg_jax.finish.compaction import Trial
-from a2tg_jax.io.compact import CompactChoices, grids_of, half_turned, load_compact
-from a2tg_jax.io.model_file import load_model, save_model
-from a2tg_jax.mcmc import Mcmc
-from a2tg_jax.measure.evaluation import evaluate
+from a2tg_jax.io.compact import grids_of, half_turned
 from a2tg_jax.results import compression
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.record import RunRecord, read_record, write_record
-from a2tg_jax.systems.a2tg import A2tg
-from a2tg_jax.texture import allocate_textures
-from a2tg_jax.training import DivergedError, reports
+from a2tg_jax.scene import origin_of_scene
+from a2tg_jax.training import reports
 from a2tg_jax.training.start import initial_model
 
 TUNE = ["compress", "--tune-iterations", "30", "--verbose"]

@@ -11,11 +11,17 @@ from scipy.linalg import expm
 from toy_system import Toy
 
 from a2tg_jax import (
+    Exposure,
     Gaussians2d,
     Gaussians2dMcmc,
+    Mcmc,
+    PoseRefinement,
+    adam_init,
+    adam_update,
     find_system,
     fit,
     load_checkpoint,
+    load_compact,
     load_model,
     save_checkpoint,
     save_compact,
@@ -23,11 +29,8 @@ from a2tg_jax import (
     synthetic_scene,
 )
 from a2tg_jax.core.cameras import moved_viewmat, rotation_exp
-from a2tg_jax.core.optim import adam_init, adam_update
-from a2tg_jax.io.compact import load_compact
-from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.training import SYSTEMS
-from a2tg_jax.training.corrections import Exposure, PoseRefinement, exposed, initial_corrections, updated
+from a2tg_jax.training.corrections import exposed, initial_corrections, updated
 
 SYSTEM = Gaussians2dMcmc(
     stage1_iterations=24, stage2_iterations=16, initial_gaussians=80, densify=Mcmc(cap=90), exposure=True,

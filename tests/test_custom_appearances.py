@@ -17,10 +17,19 @@ from test_oracle import EDGE_ON, hand_scene
 from test_render import errors
 from test_render_gradients import CLEARANCE, assert_gradients_close, differences, draw_weights
 
-from a2tg_jax import Camera, RenderSettings, allocate_textures, render_appearance
-from a2tg_jax.appearance import Appearance, Billboards, Exponents, MovableKernels
+from a2tg_jax import (
+    Appearance,
+    Camera,
+    Exponents,
+    RenderSettings,
+    allocate_textures,
+    pytree,
+    render_appearance,
+    shared,
+    static,
+)
+from a2tg_jax.appearance import Billboards, MovableKernels
 from a2tg_jax.core.numerics import normalize
-from a2tg_jax.core.pytree import pytree, shared, static
 from a2tg_jax.rasterize.views import render_traced
 
 SIDE = 4

@@ -9,11 +9,10 @@ import pytest
 from PIL import ExifTags, Image, ImageOps
 from test_data_transforms import dot_place as place_of, save_dot, shares_seen
 
+from a2tg_jax import load_scene, view_image
 from a2tg_jax.data.colmap import _model_of, _read_model, viewmat_of
 from a2tg_jax.data.colmap_cameras import MODELS, ColmapCamera
 from a2tg_jax.data.colmap_library import pycolmap
-from a2tg_jax.data.load import load_scene
-from a2tg_jax.data.scene import view_image
 
 TARGET = np.array([0.3, -0.2, 0.1])
 """A point that every camera sees; it comes first in the model, and the images show it as a white dot."""

@@ -12,17 +12,16 @@ import pytest
 from PIL import ExifTags, Image
 from test_data_colmap import dot_place, write_scene as write_colmap
 
+from a2tg_jax import load_scene, run_sfm
+from a2tg_jax.base.text import PROGRAM
 from a2tg_jax.core.camera_paths import vertical_of
 from a2tg_jax.core.cameras import intrinsics, looking
 from a2tg_jax.data import sfm, synthetic
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.decoding import picture_facts, picture_size, read_pixels, software_of
-from a2tg_jax.data.load import load_scene
 from a2tg_jax.data.photo_folder import find_photos
-from a2tg_jax.data.sfm import run_sfm
 from a2tg_jax.data.staging import stage
 from a2tg_jax.host import progress_bars
-from a2tg_jax.host.text import PROGRAM
 from a2tg_jax.results.figures import save_camera_picture
 from a2tg_jax.results.images import save_animation, write_png
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import a2tg_jax as a2tg
+from a2tg_jax import cells_scene, synthetic_scene, view_image
 from a2tg_jax.data.load import SceneSource
 from a2tg_jax.data.ray_tracing import Ball, Block, Disc, Tube
-from a2tg_jax.data.scene import view_image
-from a2tg_jax.data.synthetic import BUILT_IN, _lit_surfaces, cells_scene, exact_points, synthetic_scene
+from a2tg_jax.data.synthetic import BUILT_IN, _lit_surfaces, exact_points
 
 SHAPES = [
     Disc((0.1, 0.2, 0.3), 1.5),

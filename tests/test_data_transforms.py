@@ -8,9 +8,9 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from a2tg_jax import load_scene
 from a2tg_jax.data import assembly
 from a2tg_jax.data.colmap_library import pycolmap
-from a2tg_jax.data.load import load_scene
 
 TARGET = np.array([0.2, -0.1, 0.3])
 """The images show it as a white dot, and it is the first of the points."""

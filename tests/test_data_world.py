@@ -7,10 +7,10 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 import a2tg_jax as a2tg
+from a2tg_jax import Similarity, load_scene
 from a2tg_jax.core.camera_paths import outlying_cameras, turntable
-from a2tg_jax.core.similarity import Similarity, camera_centers
+from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.data.assembly import normalizing_similarity
-from a2tg_jax.data.load import load_scene
 from a2tg_jax.mesh.extract import common_sphere
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import a2tg_jax as a2tg
-from a2tg_jax.io.config_json import changed_config
+from a2tg_jax.core.config_json import changed_config
 
 WITHOUT_JIT, CHECKS_FOR_NAN = jax.disable_jit, functools.partial(jax.debug_nans, True)
 

@@ -8,9 +8,9 @@ import sys
 import jax
 import pytest
 
+from a2tg_jax import Session
 from a2tg_jax.cli import main as cli
 from a2tg_jax.parallel import check_batch_size
-from a2tg_jax.training import Session
 
 SCRIPT = pathlib.Path(__file__).with_name("on_devices.py")
 LONG = ("lenses", "training", "textures", "events", "details", "shared", "memory")

@@ -9,21 +9,23 @@ import numpy as np
 import pytest
 
 from a2tg_jax import (
+    Appearance,
+    Bands,
     Change,
     DivergedError,
+    Gaussians2dMcmc,
     History,
     Interrupted,
+    Mcmc,
     StepEvent,
+    allocate_appearance,
     fit,
     init_from_points,
     load_checkpoint,
+    pytree,
     save_checkpoint,
     synthetic_scene,
 )
-from a2tg_jax.appearance import Appearance, Bands, allocate_appearance
-from a2tg_jax.core.pytree import pytree
-from a2tg_jax.mcmc import Mcmc
-from a2tg_jax.systems.baselines import Gaussians2dMcmc
 from a2tg_jax.training import step
 from a2tg_jax.training.batches import BatchOrder
 from a2tg_jax.training.divergence import _not_finite, largest_loss
@@ -101,7 +103,7 @@ def test_parameters_that_nothing_but_adam_changed_are_not_checked_again(scene, m
     settings, stage, _, _, *others = run.arguments(1)
     settings = dataclasses.replace(settings, due=(True,))
     stage, state = dataclasses.replace(stage, events=(Brighten(),)), dataclasses.replace(run.state, events=(None,))
-    jax.eval_shape(lambda state: step.attempt(settings, stage, stage.clock(), state, *others), state)
+    jax.eval_shape(lambda state: step.attempt(settings, stage, stage.clock(1), state, *others), state)
     assert sizes == [1 + 5 * 60 + 60], "the loss, five gradients and the colours"
 
 

@@ -13,7 +13,7 @@ import pytest
 from test_notebooks import internal_names
 
 import a2tg_jax as a2tg
-from a2tg_jax.data.scene import origin_of_scene
+from a2tg_jax.scene import origin_of_scene
 
 DOCS = Path(__file__).parent.parent / "docs"
 REAL_FIT = inspect.signature(a2tg.fit)

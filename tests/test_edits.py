@@ -12,10 +12,11 @@ from test_upright import captured, node_matrix
 from viewer_cases import small_model
 
 import a2tg_jax as a2tg
+from a2tg_jax import Similarity
 from a2tg_jax.cli.main import main
 from a2tg_jax.core.camera_paths import turntable
 from a2tg_jax.core.floaters import floater_scores
-from a2tg_jax.core.similarity import Similarity, camera_centers
+from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.io.columns import decode
 from a2tg_jax.io.compact import decode_model, unframed
 from a2tg_jax.io.edit_file import largest_score, scores_of

@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled_programs import compiled_programs
 from test_model_rows import NUM, rows_of, some_model
 from toy_system import Rings
 
 import a2tg_jax as a2tg
-from a2tg_jax.core.optim import adam_init
-from a2tg_jax.core.pytree import combine, num_compiled, partition
+from a2tg_jax import adam_init, combine, partition
 from a2tg_jax.training.cost import forecast_stages
 from a2tg_jax.training.reports import StageEffects
 from a2tg_jax.training.step import initial_state, jitted_step
@@ -33,7 +33,7 @@ class PruneFaint(a2tg.HostEvent):
     how: str = a2tg.static(default="rows")
     last: int = a2tg.static(default=20)
 
-    def iterations(self, num_iterations):
+    def times(self, num_iterations):
         return tuple(range(4, self.last + 1, 4))
 
     def apply(self, due, model, moments, state):
@@ -56,7 +56,7 @@ class SeesBackground(a2tg.HostEvent):
 
     seen: ClassVar[list] = []
 
-    def iterations(self, num_iterations):
+    def times(self, num_iterations):
         return (1,)
 
     def apply(self, due, model, moments, state):
@@ -122,10 +122,10 @@ def test_an_event_that_removes_rows_compiles_nothing(scene):
     """With rows of other shapes each time is a program, of which the third warns; the model is the same."""
 
     def trained(how):
-        before = num_compiled(jitted_step())
-        result = fitted(scene, PruneFaint(how), iterations=22)
+        with compiled_programs("train_step") as programs:
+            result = fitted(scene, PruneFaint(how), iterations=22)
         assert result.num_regrown == 0
-        return result, num_compiled(jitted_step()) - before
+        return result, len(programs)
 
     jitted_step().clear_cache()
     kept, num_kept = trained("rows")
@@ -161,7 +161,7 @@ def test_programs_are_counted_before_and_while_it_trains(scene):
 @a2tg.pytree
 class Late(a2tg.StepEvent):
     def times(self, num_iterations):
-        return a2tg.Times(first=50, last=100, every=10)
+        return range(50, 101, 10)
 
     def apply(self, now, model, moments, state):
         return a2tg.Change(model, moments, state)
@@ -169,7 +169,7 @@ class Late(a2tg.StepEvent):
 
 @a2tg.pytree
 class Early(PruneFaint):
-    def iterations(self, num_iterations):
+    def times(self, num_iterations):
         return (-1, 0)
 
 

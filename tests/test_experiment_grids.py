@@ -25,8 +25,8 @@ from run import chosen, experiments, main, parse_arguments
 from test_data_transforms import write_blender
 
 import a2tg_jax as a2tg
-from a2tg_jax.io.config_json import flatten_config
-from a2tg_jax.training.terms import Term
+from a2tg_jax import Term
+from a2tg_jax.core.config_json import flatten_config
 
 LARGE_SCALES = ("full", "full_size", "half_size", "long", "paper160")
 NEED_CHOICES = (("bytewise", "protocol"), ("claims", "claims"), ("confirmation", "claims"))
@@ -437,7 +437,7 @@ def test_placed_methods_have_the_weight_and_the_new_gaussians_of_bytewise():
     for system in placed:
         first, last = system.stages()
         place = first.events[-1]
-        assert isinstance(place, a2tg.PlaceByError) and place.iterations(first.iterations)
+        assert isinstance(place, a2tg.PlaceByError) and place.times(first.iterations)
         assert place.cap == int(0.3e6) // (4 * {0: 13, 1: 22}[system.sh_degree])
         weights = [
             [term.weight for term in stage.losses if getattr(term, "name", "") == "opacity"] for stage in (first, last)

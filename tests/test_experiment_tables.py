@@ -22,7 +22,6 @@ from lab.jobs import Folders, Job
 from lab.kept import read_kept
 from lab.plan import duration
 from lab.scenes import SceneAt
-from lab.stages import chain
 from run import experiments, main, parse_arguments
 
 import a2tg_jax as a2tg
@@ -85,7 +84,7 @@ def test_times_of_the_efficiency_page_are_measured_once(tmp_path, monkeypatch):
     given = ["efficiency", "--scale", "smoke", "--out", str(tmp_path / "out"), "--work", str(tmp_path / "work")]
     lab = Lab(parse_arguments(experiments(), given))
     grid, fitted = lab.grid("efficiency"), []
-    for job in (one for last in grid.jobs({}) for one in chain(last)):
+    for job in (one for last in grid.jobs({}) for one in last.chain):
         path = lab.folders.model(job)
         path.parent.mkdir(parents=True, exist_ok=True)
         a2tg.save_model(path, small_models.some_model())
@@ -313,9 +312,9 @@ def test_registered_endpoints_are_decided_by_interval_and_corrected_p_value():
     for index in range(9):
         capture, wobble = f"capture {index}", 0.1 * index
         results += [
-            claims_result(capture, claims.BYTEWISE, 26.0 + wobble, training_seconds=10.0),
+            claims_result(capture, claims.BYTEWISE, 26.0 + wobble),
             claims_result(capture, claims.STRONGEST, 25.0 + 2 * wobble),
-            claims_result(capture, claims.STRONGEST, 25.0, equal="time", training_seconds=10.5),
+            claims_result(capture, claims.STRONGEST, 25.0, equal="time"),
         ]
     unseen = [
         claims_result("alexander", claims.BYTEWISE, 30.0),
@@ -328,4 +327,20 @@ def test_registered_endpoints_are_decided_by_interval_and_corrected_p_value():
     assert primary[:1] + primary[3:] == ["| primary", "+1.40 ± 0.21", "9/9", ".004", "**decided**", "-0.50 |"]
     assert iterations[:1] + iterations[3:] == ["| secondary", "+0.60 ± 0.21", "9/9", ".008", "**decided**", "– |"]
     assert lpips[3:] == ["+0.000 ± 0.000", "0/9", "1.000", "undecided", "+0.000 |"]
-    assert claims.times_text(results).startswith("The last stages of equal time took 1.05 to 1.05 times as long")
+
+
+def test_equal_time_is_the_time_of_all_stages():
+    """Of stages alone, the ratios would be 0.4 and 38 / 30."""
+    seconds = {
+        claims.BYTEWISE: (Job("fox", 2, a2tg.Bytewise(), 1), "", (30.0, 10.0)),
+        claims.STRONGEST: (Job("fox", 2, a2tg.A2tg(), 1), "time", (38.0, 4.0)),
+    }
+    results, records = [], {}
+    for label, (job, equal, times) in seconds.items():
+        one = claims_result("fox", label, 25.0, equal=equal)
+        results.append(dataclasses.replace(one, run=dataclasses.replace(one.run, job=job)))
+        records |= {stage.key: record(training_seconds=time) for stage, time in zip(job.chain, times, strict=True)}
+    text = claims.times_text(results, records)
+    assert text.startswith("The trainings of equal time took 1.05 to 1.05 times as long"), text
+    del records[results[0].run.job.start.key]
+    assert claims.times_text(results, records) == "", "a stage has no time"

@@ -9,33 +9,70 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 from experiment_records import record
 from lab import queue, versions
 from lab.cli import EXPERIMENTS, Lab, argument_parser
 from lab.grid import read_grid
-from lab.jobs import TIMES, Folders, Job, _load_checkpoint, milliseconds, model_bytes, run_job
+from lab.jobs import TIMES, Folders, Job, milliseconds, model_bytes, run_job
 from lab.plan import Machine, duration, finished_pace, missing_text, plan_of
 from lab.progress import Progress
 from lab.stages import stages_of
 from run import experiments, interruptible, main, parse_arguments
 
 import a2tg_jax as a2tg
-from a2tg_jax.training import fit_stage
+from a2tg_jax import fit_stage
 
 
-@pytest.mark.long
-def test_a_stage_stopped_under_one_system_goes_on_under_another(tmp_path):
+def test_a_stage_stopped_under_one_system_continues_under_another(tmp_path, monkeypatch):
+    """From a checkpoint under the name that sweeps gave it before, and to the same model, bit for bit."""
     scene = a2tg.synthetic_scene(num_views=3, width=24, height=16, num_points=30)
-    plain, textured = (a2tg.find_system(name).preset("smoke") for name in ("gaussians-2d-mcmc", "textured-gaussians"))
-    plain, textured = (dataclasses.replace(system, stage1_iterations=4) for system in (plain, textured))
-    path = tmp_path / "checkpoint.npz"
-    stopped = lambda checkpoint: checkpoint.iteration == 2 and a2tg.save_checkpoint(path, checkpoint)  # noqa: E731
+    monkeypatch.setattr(Folders, "load_scene", lambda self, job: scene)
+    plain = a2tg.find_system("gaussians-2d-mcmc").preset("smoke", stage1_iterations=4)
+    textured = a2tg.find_system("textured-gaussians").preset("smoke", stage1_iterations=4)
+    job = Job("synthetic", 1, textured, 0)
+    assert job.key == dataclasses.replace(job, system=plain).key
+    folders = Folders(tmp_path, tmp_path)
+    former = tmp_path / "checkpoints" / f"{job.key}.npz"
+    stopped = lambda checkpoint: checkpoint.iteration == 2 and a2tg.save_checkpoint(former, checkpoint)  # noqa: E731
+    whole = fit_stage(scene, plain, 0, on_checkpoint=stopped, checkpoint_every=2, progress=False).model
+    record = run_job(job, folders)
+    assert record["training_seconds"] is None, "the time up to the checkpoint is not known"
+    np.testing.assert_array_equal(a2tg.load_model(folders.model(job)).gaussians.means, whole.gaussians.means)
+    assert not [*former.parent.iterdir()]
+    other = Job("synthetic", 1, dataclasses.replace(textured, seed=5), 0)
     fit_stage(scene, plain, 0, on_checkpoint=stopped, checkpoint_every=2, progress=False)
-    resumed = _load_checkpoint(path, Job("synthetic", 1, textured, 0))
-    assert fit_stage(scene, textured, 0, resume=resumed, progress=False).model.num > 0
-    with pytest.raises(ValueError, match="made with other numbers"):
-        _load_checkpoint(path, Job("synthetic", 1, dataclasses.replace(textured, seed=5), 0))
+    former.replace(former.with_name(f"{other.key}.npz"))
+    with pytest.raises(ValueError, match="made with another seed"):
+        run_job(other, folders)
+
+
+def test_the_checkpoint_before_a_damaged_one_continues_a_stage(tmp_path, monkeypatch):
+    scene = a2tg.synthetic_scene(num_views=3, width=24, height=16, num_points=30)
+    monkeypatch.setattr(Folders, "load_scene", lambda self, job: scene)
+    job = Job("synthetic", 1, a2tg.find_system("gaussians-2d-mcmc").preset("smoke", stage1_iterations=4), 0)
+    folders = Folders(tmp_path, tmp_path)
+    files = folders.files
+    keep = lambda checkpoint: a2tg.save_checkpoint(files.checkpoint(job.key, checkpoint.iteration), checkpoint)  # noqa: E731
+    whole = fit_stage(scene, job.system, 0, on_checkpoint=keep, checkpoint_every=2, progress=False).model
+    newest = files.checkpoints(job.key)[-1]
+    newest.write_bytes(newest.read_bytes()[:1000])
+    with pytest.warns(UserWarning, match="training continues from .*-0000000002.npz"):
+        run_job(job, folders)
+    np.testing.assert_array_equal(a2tg.load_model(folders.model(job)).gaussians.means, whole.gaussians.means)
+    assert not [*newest.parent.iterdir()]
+
+
+class AfterQuestions:
+    """A time that has come when it has been compared a number of times."""
+
+    def __init__(self, num):
+        self.left = num
+
+    def __le__(self, now):
+        self.left -= 1
+        return self.left < 0
 
 
 def test_a_stage_stops_at_its_time_and_is_timed_only_if_it_ran_alone(tmp_path, monkeypatch):
@@ -44,13 +81,15 @@ def test_a_stage_stops_at_its_time_and_is_timed_only_if_it_ran_alone(tmp_path, m
     system = a2tg.find_system("gaussians-2d-mcmc").preset("smoke", stage1_iterations=20, stage2_iterations=0)
     job, folders = Job("synthetic", 1, system, 0), Folders(tmp_path, tmp_path)
     assert run_job(job, folders, stop_at=time.monotonic()) is None
+    assert not folders.files.checkpoints(job.key), "the beginning needs none"
+    assert run_job(job, folders, stop_at=AfterQuestions(1)) is None
     assert json.loads(folders.time_so_far(job).read_text()) >= 0
-    assert folders.checkpoint(job).is_file() and not folders.model(job).is_file() and not folders.record(job).is_file()
+    assert folders.files.checkpoints(job.key) and not folders.model(job).is_file() and not folders.record(job).is_file()
     folders.time_so_far(job).write_text("1000000.0")
     alone = run_job(job, folders)
     assert 1e6 < alone["training_seconds"] < 1e6 + 600 and not folders.time_so_far(job).exists()
     assert alone["alone"] and alone["device"] and all(alone[name] is not None for name in TIMES)
-    assert not folders.checkpoint(job).is_file()
+    assert not folders.files.checkpoints(job.key)
     again = dataclasses.replace(job, system=dataclasses.replace(system, seed=1))
     folders.shared(again).parent.mkdir()
     folders.shared(again).touch()

@@ -11,11 +11,11 @@ from small_models import some_checkpoint, some_model
 
 import a2tg_jax as a2tg
 from a2tg_jax.appearance import template_of
+from a2tg_jax.base.archive import FORMAT, read_archive, write_archive
 from a2tg_jax.cli.main import main
-from a2tg_jax.io.archive import FORMAT, read_archive, write_archive
 from a2tg_jax.io.compact import decode_model, framed, unframed
-from a2tg_jax.io.model_file import FORMAT as MODEL_FORMAT
 from a2tg_jax.io.web_scene import encode_web_scene
+from a2tg_jax.model_file import FORMAT as MODEL_FORMAT
 from a2tg_jax.results.record import read_record, write_record
 
 NARROW = a2tg.TextureOptions(outside="identity", extent=1.5)

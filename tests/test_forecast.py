@@ -14,14 +14,12 @@ import pytest
 from toy_system import Toy
 
 import a2tg_jax as a2tg
+from a2tg_jax import BilateralGrid, Corrections, Mcmc, Picture, Prune, resize_camera
+from a2tg_jax.base import machine
+from a2tg_jax.base.machine import allowed_memory
 from a2tg_jax.cli import main as cli
 from a2tg_jax.cli.train import ask
-from a2tg_jax.core.cameras import resize_camera
-from a2tg_jax.data.photo_store import Picture
-from a2tg_jax.densify.pruning import Prune
-from a2tg_jax.host import machine, progress_bars
-from a2tg_jax.host.machine import allowed_memory
-from a2tg_jax.mcmc import Mcmc
+from a2tg_jax.host import progress_bars
 from a2tg_jax.results.commands import quick_flags
 from a2tg_jax.results.forecast import (
     RunForecast,
@@ -34,13 +32,12 @@ from a2tg_jax.results.forecast import (
 from a2tg_jax.results.plan import plan_run
 from a2tg_jax.results.record import RunRecord, SceneSource
 from a2tg_jax.training import SYSTEMS, fitting, reports
-from a2tg_jax.training.corrections import BilateralGrid, sliced
+from a2tg_jax.training.corrections import sliced
 from a2tg_jax.training.cost import Bytes, check_rows_fit, forecast_stages, stage_bytes
 from a2tg_jax.training.loop import StageRun
-from a2tg_jax.training.options import Corrections
 from a2tg_jax.training.reports import Pace, RestOfRun
 from a2tg_jax.training.start import initial_model
-from a2tg_jax.training.step import StepSettings, jitted_step
+from a2tg_jax.training.step import jitted_step
 
 MB = 10**6
 
@@ -87,10 +84,7 @@ def test_a_step_needs_what_xla_says(width, height, num):
     scene = dataclasses.replace(scene_of(width, height), points=points, colors=np.full_like(points, 0.5))
     system = a2tg.Gaussians2dMcmc(stage1_iterations=4, densify=a2tg.Mcmc(cap=num))
     run = StageRun(scene, system, 0, initial_model(scene, system))
-    photographs, views = run.photographs.batch(1)
-    settings = StepSettings(run.render_settings((height, width)), system.background)
-    args = (settings, run.stage, run.clock, run.state, photographs, views, run.scene_scale, run.key)
-    lowered = jitted_step().lower(*args)
+    lowered = jitted_step().lower(*run.arguments(1))
     said = lowered.compile().memory_analysis()
     expected = stage_bytes(scene, system, run.stage, num, run.model.num_bytes)
     step = expected.gradients + expected.pixels

@@ -14,8 +14,15 @@ from small_values import some_gaussians
 
 from a2tg_jax import (
     A2tg,
+    Appearance,
+    Camera,
+    Exponents,
     Gaussians2d,
     Model,
+    Origin,
+    Similarity,
+    Texture,
+    allocate_appearance,
     init_from_points,
     load_model,
     load_ply,
@@ -26,14 +33,11 @@ from a2tg_jax import (
     synthetic_scene,
     transform_gaussians,
 )
-from a2tg_jax.appearance import Appearance, Exponents, MovableKernels, Texture, allocate_appearance, template_of
+from a2tg_jax.appearance import MovableKernels, template_of
+from a2tg_jax.base.archive import write_archive
 from a2tg_jax.cli.main import main
-from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.origin import Origin
-from a2tg_jax.core.similarity import Similarity
-from a2tg_jax.io.archive import write_archive
 from a2tg_jax.io.formats import FORMATS, file_bytes, files_of, format_of, lost_by, unseen_elsewhere
-from a2tg_jax.io.model_file import number_in_file
+from a2tg_jax.model_file import number_in_file
 from a2tg_jax.results import model_source, run_training
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.model_source import check_init, write_first_stage

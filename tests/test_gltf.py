@@ -15,15 +15,13 @@ from small_values import some_gaussians, some_world
 from test_compact import MODELS, every_model, plain, shaped, textured
 
 import a2tg_jax as a2tg
-from a2tg_jax.appearance import Exponents, MovableKernels, TextureOptions, allocate_appearance, template_of
+from a2tg_jax import Exponents, Model, Origin, Similarity, TextureOptions, allocate_appearance, load_gltf, save_gltf
+from a2tg_jax.appearance import MovableKernels, template_of
 from a2tg_jax.core.gaussians import rotation_matrices
-from a2tg_jax.core.origin import Origin
-from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.io import gltf, other_programs
-from a2tg_jax.io.gltf import EXTENSION, load_gltf, save_gltf
+from a2tg_jax.io.gltf import EXTENSION
 from a2tg_jax.io.gltf_container import Document
 from a2tg_jax.io.other_programs import joined_parts, matrix_of, upright
-from a2tg_jax.model import Model
 
 SPLATS = "KHR_gaussian_splatting"
 

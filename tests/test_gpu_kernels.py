@@ -20,9 +20,8 @@ from scenes_random import (
     quick_then_long,
 )
 
-from a2tg_jax import RenderSettings, render_image
-from a2tg_jax.appearance import Appearance, StaticShading, Texture, TextureOptions
-from a2tg_jax.core.pytree import combine, partition
+from a2tg_jax import Appearance, RenderSettings, Texture, TextureOptions, combine, partition, render_image
+from a2tg_jax.appearance import StaticShading
 from a2tg_jax.rasterize.kernels.cuda import composite, nvrtc
 from a2tg_jax.rasterize.kernels.cuda.source import PRIMITIVES, Argument, c_function, source
 from a2tg_jax.rasterize.kernels.jaxprs import Untranslatable, example, trace

@@ -12,8 +12,8 @@ from oracle import DEFAULT_RULES
 from scenes_random import CAPACITY, as_camera, as_gaussians, as_textures, draw_scene
 
 import a2tg_jax as a2tg
-from a2tg_jax import Appearance, Model, RenderSettings, Texture, view_gradients
-from a2tg_jax.events import Seen, read_probe
+from a2tg_jax import Appearance, Model, RenderSettings, Seen, Texture, view_gradients
+from a2tg_jax.events import read_probe
 from a2tg_jax.rasterize.views import render_traced
 
 

@@ -10,7 +10,8 @@ from run_folders import create_run
 from small_values import some_gaussians
 
 import a2tg_jax as a2tg
-from a2tg_jax.appearance import Appearance, Exponents, Texture, allocate_appearance, template_of
+from a2tg_jax import Appearance, Exponents, Texture, allocate_appearance
+from a2tg_jax.appearance import template_of
 from a2tg_jax.appearance.parts import nearest_gaussians
 from a2tg_jax.results.model_source import check_init, write_first_stage
 from a2tg_jax.results.record import RunRecord, SceneSource

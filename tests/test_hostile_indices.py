@@ -15,8 +15,8 @@ import pytest
 from scenes_random import as_camera, as_gaussians, as_textures, assert_all_close, draw_scene, quick_then_long
 
 import a2tg_jax as a2tg
-from a2tg_jax.appearance import Appearance, Billboards, Texture
-from a2tg_jax.core.bilinear import TextureRegion
+from a2tg_jax import Appearance, Texture, TextureRegion
+from a2tg_jax.appearance import Billboards
 from a2tg_jax.rasterize.compositor import composite
 from a2tg_jax.rasterize.kernels.native import composite as native
 from a2tg_jax.rasterize.splats import project_gaussians, settings_of_pass

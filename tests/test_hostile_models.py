@@ -14,23 +14,32 @@ from hostile_files import put
 from small_models import NUM, some_checkpoint, some_gaussians, some_model
 
 import a2tg_jax as a2tg
-from a2tg_jax import load_compact, save_compact, save_gltf
-from a2tg_jax.core.origin import Origin
+from a2tg_jax import (
+    Bytewise,
+    Model,
+    Origin,
+    Textures,
+    load_checkpoint,
+    load_compact,
+    load_lpips,
+    load_model,
+    load_ply,
+    plan_render,
+    save_checkpoint,
+    save_compact,
+    save_gltf,
+    save_model,
+    save_ply,
+)
+from a2tg_jax.base.archive import FORMAT as CHECKPOINT, read_archive, write_archive
+from a2tg_jax.base.json_text import parse_json
+from a2tg_jax.base.npz import read_npz
 from a2tg_jax.core.table import check_places
-from a2tg_jax.host.json_text import parse_json
-from a2tg_jax.host.npz import read_npz
 from a2tg_jax.io import ply
-from a2tg_jax.io.archive import FORMAT as CHECKPOINT, read_archive, write_archive
-from a2tg_jax.io.model_file import FORMAT as MODEL, load_model, save_model
-from a2tg_jax.io.ply import load_ply, save_ply
-from a2tg_jax.io.validate import check_model
-from a2tg_jax.measure.metrics import load_lpips
-from a2tg_jax.model import Model
+from a2tg_jax.model import check_model
+from a2tg_jax.model_file import FORMAT as MODEL
 from a2tg_jax.rasterize.views import render_traced
-from a2tg_jax.renderer import plan_render
-from a2tg_jax.systems.bytewise import Bytewise
-from a2tg_jax.texture import Textures, check_textures
-from a2tg_jax.training import load_checkpoint, save_checkpoint
+from a2tg_jax.texture import check_textures
 from a2tg_jax.training.registry import system_from_dict
 
 

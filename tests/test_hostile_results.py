@@ -9,14 +9,14 @@ import pytest
 from hostile_files import put
 from run_folders import create_run
 
+from a2tg_jax import History
+from a2tg_jax.base.json_text import DEEPEST, parse_json, parse_toml, read_json
 from a2tg_jax.cli import main as cli
-from a2tg_jax.host.json_text import DEEPEST, parse_json, parse_toml, read_json
 from a2tg_jax.results.figures import curves_figure
 from a2tg_jax.results.folder import MOST_NAMES, RunFolder, open_run
 from a2tg_jax.results.history import NAMES, read_history, write_history
 from a2tg_jax.results.info import read_psnrs
 from a2tg_jax.results.record import RunRecord, SceneSource, chosen_system, read_record, read_run_file, write_record
-from a2tg_jax.training import History
 
 HEAD = ",".join(NAMES)
 

@@ -21,8 +21,8 @@ from test_data_transforms import (
     write_scene as write_transforms,
 )
 
+from a2tg_jax import load_scene
 from a2tg_jax.data.colmap_files import KINDS, read_file
-from a2tg_jax.data.load import load_scene
 from a2tg_jax.data.ply import read_ply_points
 
 

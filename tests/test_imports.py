@@ -11,14 +11,15 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "a2tg_jax"
 LAYERS = (
-    {"host"},
-    {"core", "parallel"},
-    {"texture", "data"},
+    {"base"},
+    {"core", "parallel", "host"},
+    {"texture", "scene"},
     {"appearance"},
     {"rasterize"},
     {"render"},
     {"model"},
-    {"events", "renderer", "io"},
+    {"events", "renderer", "model_file", "data"},
+    {"io"},
     {"adapt", "mcmc"},
     {"densify"},
     {"training"},
@@ -115,11 +116,13 @@ def test_mathematics_knows_nothing_of_the_host():
     """Threads of native loops and the result of a GPU's check are the exceptions, and the words of errors."""
     rooms = {"core", "texture", "appearance", "rasterize", "render", "model", "events", "adapt", "mcmc", "densify"}
     own = [path for path in MODULES if component(path) in rooms]
-    found = {dotted(path): {name for name in modules_imported(path) if name.startswith("host.")} for path in own}
-    known = {name: hosts - {"host.text"} for name, hosts in found.items()}
+    found = {
+        dotted(path): {name for name in modules_imported(path) if name.startswith(("host.", "base."))} for path in own
+    }
+    known = {name: hosts - {"base.text"} for name, hosts in found.items()}
     assert {name: hosts for name, hosts in known.items() if hosts} == {
-        "rasterize.kernels.cuda.check": {"host.atomic", "host.operating_system", "host.startup"},
-        "rasterize.kernels.native.ffi": {"host.machine"},
+        "rasterize.kernels.cuda.check": {"base.atomic", "base.operating_system", "base.machine"},
+        "rasterize.kernels.native.ffi": {"base.machine"},
     }
 
 
@@ -138,7 +141,7 @@ def test_one_module_tells_systems_apart():
     """The C library's mathematics has another name on Windows, and a report names the system."""
     asking = re.compile(r"sys\.platform|os\.name\b|import (fcntl|msvcrt|resource)\b|sched_getaffinity")
     found = {dotted(path) for path in MODULES if asking.search(path.read_text(encoding="utf-8"))}
-    assert found == {"host.operating_system", "rasterize.kernels.native.llvm_code", "results.report"}
+    assert found == {"base.operating_system", "rasterize.kernels.native.llvm_code", "results.report"}
 
 
 def test_import_leaves_jax_alone():

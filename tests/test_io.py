@@ -11,19 +11,25 @@ import pytest
 from scipy.spatial.transform import Rotation
 from small_values import assert_same, some_gaussians, some_world
 
-from a2tg_jax.appearance import Billboards, MovableKernels, allocate_appearance
-from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.gaussians import init_from_points
-from a2tg_jax.core.origin import Origin
+from a2tg_jax import (
+    Camera,
+    Model,
+    Origin,
+    allocate_appearance,
+    init_from_points,
+    load_ply,
+    render_image,
+    save_model,
+    save_ply,
+    textures_from_arrays,
+    transform_gaussians,
+)
+from a2tg_jax.appearance import Billboards, MovableKernels
+from a2tg_jax.base.archive import read_archive, read_archive_header, write_archive
+from a2tg_jax.core.config_json import config_from_dict, config_to_dict, flatten_config
 from a2tg_jax.core.sh import sh_basis
-from a2tg_jax.core.similarity import sh_rotation, transform_gaussians
-from a2tg_jax.io.archive import read_archive, read_archive_header, write_archive
-from a2tg_jax.io.config_json import config_from_dict, config_to_dict, flatten_config
-from a2tg_jax.io.model_file import save_model
-from a2tg_jax.io.ply import ATTRIBUTES, encode_ply, load_ply, save_ply
-from a2tg_jax.model import Model
-from a2tg_jax.render import render_image
-from a2tg_jax.texture import textures_from_arrays
+from a2tg_jax.core.similarity import sh_rotation
+from a2tg_jax.io.ply import ATTRIBUTES, encode_ply
 
 
 def write_ply(path, names, rows, encoding="binary_little_endian", types=None) -> None:

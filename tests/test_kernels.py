@@ -12,15 +12,24 @@ import oracle
 import pytest
 from scenes_random import as_camera, as_gaussians, as_textures, assert_all_close, draw_scene, quick_then_long
 
-from a2tg_jax import RenderSettings, render_appearance, render_image
-from a2tg_jax.appearance import Appearance, Exponents, StaticShading, Texture, TextureOptions, gaussian_cutoff
-from a2tg_jax.core.bilinear import TextureRegion
+from a2tg_jax import (
+    Appearance,
+    Exponents,
+    RenderSettings,
+    Texture,
+    TextureOptions,
+    TextureRegion,
+    pytree,
+    render_appearance,
+    render_image,
+    static,
+    textures_from_arrays,
+)
+from a2tg_jax.appearance import StaticShading, gaussian_cutoff
 from a2tg_jax.core.geometry import homographies
-from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.rasterize.kernels.native import composite as native, ffi
 from a2tg_jax.rasterize.tiles import TileGrid, tile_lists, total_pairs
 from a2tg_jax.rasterize.views import render_traced
-from a2tg_jax.texture import textures_from_arrays
 
 long = pytest.mark.long
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import a2tg_jax as a2tg
-from a2tg_jax.training import LearningRates
+from a2tg_jax import LearningRates
 from a2tg_jax.training.batches import BatchOrder
 from a2tg_jax.training.reports import LearningCheck, flat_psnr
 

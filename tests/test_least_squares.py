@@ -10,10 +10,18 @@ import pytest
 from test_view_dependence import banded
 
 import a2tg_jax as a2tg
-from a2tg_jax.appearance import Appearance, Exponents, Texture, TextureOptions, allocate_appearance
-from a2tg_jax.data.scene import View, view_image
-from a2tg_jax.finish.polishing import colors_of, draw_change, polish, with_colors
-from a2tg_jax.renderer import plan_render
+from a2tg_jax import (
+    Appearance,
+    Exponents,
+    Texture,
+    TextureOptions,
+    View,
+    allocate_appearance,
+    plan_render,
+    polish,
+    view_image,
+)
+from a2tg_jax.finish.polishing import colors_of, draw_change, with_colors
 
 
 def some_views(model, camera, seed: int = 0, num: int = 3) -> list[View]:

@@ -11,15 +11,11 @@ import numpy as np
 from small_models import with_row
 from test_compact import plain, textured
 
-from a2tg_jax import Gaussians2dMcmc, synthetic_scene
-from a2tg_jax.appearance import Billboards, allocate_appearance
+from a2tg_jax import Gaussians2dMcmc, History, Mcmc, Model, allocate_appearance, fit_stage, synthetic_scene
+from a2tg_jax.appearance import Billboards
 from a2tg_jax.io.compact import unframed
-from a2tg_jax.mcmc import Mcmc
-from a2tg_jax.model import Model
 from a2tg_jax.results.run_training import unseen
 from a2tg_jax.results.viewing import SECONDS, SHARE, LiveView, shown_live
-from a2tg_jax.training import fit_stage
-from a2tg_jax.training.checkpoint import History
 from a2tg_jax.training.loop import never
 from a2tg_jax.web.server import Door, application
 

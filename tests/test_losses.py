@@ -7,13 +7,19 @@ import pytest
 from jax.test_util import check_grads
 from skimage.metrics import structural_similarity
 
-from a2tg_jax import Model, value_and_grad
-from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.gaussians import init_from_points
+from a2tg_jax import (
+    Camera,
+    Model,
+    init_from_points,
+    normal_consistency,
+    photometric_loss,
+    ssim as kernel,
+    value_and_grad,
+)
 from a2tg_jax.rasterize.kernels import platforms, window_scores
-from a2tg_jax.rasterize.kernels.native import ffi, ssim as kernel
+from a2tg_jax.rasterize.kernels.native import ffi
 from a2tg_jax.rasterize.kernels.window_scores import Score
-from a2tg_jax.training.losses import depth_normals, live_mean, mean_ssim, normal_consistency, photometric_loss
+from a2tg_jax.training.losses import depth_normals, live_mean, mean_ssim
 from a2tg_jax.training.terms import opacity, scale
 
 

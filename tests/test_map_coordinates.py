@@ -13,9 +13,8 @@ from run_folders import create_run
 from small_values import some_gaussians
 
 import a2tg_jax as a2tg
+from a2tg_jax import Origin, Similarity
 from a2tg_jax.cli.main import main
-from a2tg_jax.core.origin import Origin
-from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.data.ply import read_ply_points
 from a2tg_jax.io.other_programs import upright
 from a2tg_jax.results.model_source import write_first_stage

@@ -12,9 +12,8 @@ from skimage.metrics import structural_similarity
 from test_data_colmap import HEIGHT, WIDTH, dot_place, write_scene
 from test_data_transforms import FOCAL, SIZE, write_frames, write_json
 
-from a2tg_jax import Gaussians2dMcmc, evaluate, fit, load_scene, polish, psnr, ssim, synthetic_scene
+from a2tg_jax import Gaussians2dMcmc, evaluate, fit, load_lpips, load_scene, lpips, polish, psnr, ssim, synthetic_scene
 from a2tg_jax.data.photo_reading import read_mask
-from a2tg_jax.measure.metrics import load_lpips, lpips
 from a2tg_jax.training.start import initial_model
 
 NAMES = tuple(f"img_{index:02d}.png" for index in range(9))

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from a2tg_jax.core.gaussians import DEAD_OPACITY, Gaussians, logit, rotation_matrices, share, stacked_integral
-from a2tg_jax.core.optim import AdamState, adam_init
-from a2tg_jax.mcmc import draw_hosts, grow, perturb, relocate
+from a2tg_jax import AdamState, Gaussians, adam_init, grow, perturb, relocate
+from a2tg_jax.core.gaussians import DEAD_OPACITY, logit, rotation_matrices, share, stacked_integral
+from a2tg_jax.mcmc import draw_hosts
 
 KEY = jax.random.key(0)
 NUM = 64

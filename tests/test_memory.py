@@ -10,13 +10,11 @@ import jax.numpy as jnp
 import psutil
 import pytest
 
-from a2tg_jax import fit, synthetic_scene
-from a2tg_jax.host import machine, operating_system
+from a2tg_jax import Gaussians2dMcmc, Session, fit, synthetic_scene
+from a2tg_jax.base import machine, operating_system
+from a2tg_jax.base.machine import keep_room_for_programs, memory_limit, tidy_memory
+from a2tg_jax.base.operating_system import trim_heap
 from a2tg_jax.host.errors import error_text
-from a2tg_jax.host.machine import keep_room_for_programs, memory_limit, tidy_memory
-from a2tg_jax.host.operating_system import trim_heap
-from a2tg_jax.systems.baselines import Gaussians2dMcmc
-from a2tg_jax.training import Session
 from a2tg_jax.training.step import jitted_step
 
 

@@ -8,11 +8,18 @@ from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from small_models import write_random_squeeze
 
-from a2tg_jax.appearance import Appearance, Texture
-from a2tg_jax.core.gaussians import init_from_points
-from a2tg_jax.measure.metrics import load_lpips, lpips, parameter_bytes, psnr, ssim
-from a2tg_jax.model import Model
-from a2tg_jax.texture import allocate_textures
+from a2tg_jax import (
+    Appearance,
+    Model,
+    Texture,
+    allocate_textures,
+    init_from_points,
+    load_lpips,
+    lpips,
+    parameter_bytes,
+    psnr,
+    ssim,
+)
 
 
 def random_image(seed, shape=(24, 20, 3)):

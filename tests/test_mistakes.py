@@ -23,19 +23,16 @@ from small_values import some_gaussians, some_world
 from test_data_colmap import write_scene as write_colmap
 
 import a2tg_jax as a2tg
-from a2tg_jax import appearance, mcmc
-from a2tg_jax.appearance import Appearance, Arguments, StaticShading, elementwise_functions, takes_arrays
+from a2tg_jax import Appearance, Checkpoint, Geometry, History, appearance, mcmc, pytree, render_appearance, static
+from a2tg_jax.appearance import Arguments, StaticShading, elementwise_functions, takes_arrays
 from a2tg_jax.cli import main as cli
-from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.data.load import SceneSource
-from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.rasterize.kernels import platforms
-from a2tg_jax.rasterize.render_types import Geometry
 from a2tg_jax.rasterize.views import render_traced
-from a2tg_jax.render import render_appearance
 from a2tg_jax.results import run_training
 from a2tg_jax.results.record import RunRecord, write_record
-from a2tg_jax.training import Checkpoint, History, corrections, losses, options
+from a2tg_jax.scene import origin_of_scene
+from a2tg_jax.training import corrections, losses, options
 from a2tg_jax.training.checkpoint import check_resume
 from a2tg_jax.training.start import initial_model
 from a2tg_jax.training.terms import Photometric, l1
@@ -555,9 +552,9 @@ CALLS = {
     "staged(events=(Noise(), Noise))": "stage 'own' … events[1] … StepEvent or a HostEvent … the class Noise",
     "staged(events=(Undecorated(),))": "stage 'own' … events[0] … pytree … Undecorated",
     "staged(events=(Named(),))": "stage 'own' … events[0] … numbers … 'a' … Named",
-    "staged(events=(made(HostEvent, iterations=lambda self, num: (0.5,)),))": "Mine.iterations … ascending … (0.5,)",
-    "staged(events=(made(HostEvent, iterations=lambda self, num: range(1, num, 0)),))": "Mine.iterations … zero",
-    "staged(events=(made(StepEvent, times=lambda self, num: Times(1, num, 0)),))": "Mine.times … every … at least 1",
+    "staged(events=(made(HostEvent, times=lambda self, num: (0.5,)),))": "Mine.times … ascending … (0.5,)",
+    "staged(events=(made(HostEvent, times=lambda self, num: range(1, num, 0)),))": "Mine.times … zero",
+    "staged(events=(made(StepEvent, times=lambda self, num: range(num, 0, -1)),))": "Mine.times … ascending … range(",
     "staged(losses=roughness)": "stage 'own' … losses … tuple or a list … function",
     "staged(losses=())": "stage 'own' … losses",
     "staged(losses=(roughness,))": "stage 'own' … losses[0] … loss term … function … Term(roughness)",
@@ -574,10 +571,10 @@ CALLS = {
     "trained(events=(made(StepEvent, observes=True, observe=lambda self, state, model, seen: seen.colors),))": (
         "Mine.observe … structure"
     ),
-    "trained(events=(made(HostEvent, iterations=lambda self, num: (1,), apply=lambda self, due, *result: result),))": (
+    "trained(events=(made(HostEvent, times=lambda self, num: (1,), apply=lambda self, due, *result: result),))": (
         "stage 'own' … Mine.apply … Change … tuple"
     ),
-    "trained(events=(made(HostEvent, iterations=lambda self, num: (1,), apply=nothing_left),))": (
+    "trained(events=(made(HostEvent, times=lambda self, num: (1,), apply=nothing_left),))": (
         "Mine.apply … is_kept … at least 2 … 0 of 50"
     ),
     "TextureOptions(extent=0)": "extent must be at least 0.001 and at most 1000; got 0",

@@ -11,16 +11,31 @@ from scenes_random import as_camera, as_gaussians, draw_scene
 from small_values import assert_same, some_gaussians, some_world
 from test_hostile_models import refused, spoiled, with_array, with_header
 
-from a2tg_jax import concatenate, save_ply, to_gsplat
-from a2tg_jax.appearance import Appearance, Bands, Exponents, Texture, TextureOptions, allocate_appearance, template_of
-from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.origin import Origin
-from a2tg_jax.core.pytree import pytree, static
-from a2tg_jax.io.archive import read_archive, read_archive_header, write_archive
-from a2tg_jax.io.model_file import FORMAT, load_model, save_model
-from a2tg_jax.model import Model
-from a2tg_jax.render import RenderSettings, render_appearance
-from a2tg_jax.texture import texture_arrays, textures_from_arrays
+from a2tg_jax import (
+    Appearance,
+    Bands,
+    Camera,
+    Exponents,
+    Model,
+    Origin,
+    RenderSettings,
+    Texture,
+    TextureOptions,
+    allocate_appearance,
+    concatenate,
+    load_model,
+    pytree,
+    render_appearance,
+    save_model,
+    save_ply,
+    static,
+    texture_arrays,
+    textures_from_arrays,
+    to_gsplat,
+)
+from a2tg_jax.appearance import template_of
+from a2tg_jax.base.archive import read_archive, read_archive_header, write_archive
+from a2tg_jax.model_file import FORMAT
 
 SIZES = [(1, 1), (4, 2), (1, 4), (2, 2), (4, 2), (1, 1), (3, 5)]
 

@@ -8,22 +8,26 @@ import numpy as np
 import pytest
 from scenes_random import as_gaussians, draw_scene
 
-from a2tg_jax import adam_init, adam_update, combine, concatenate, partition, value_and_grad
-from a2tg_jax.appearance import (
+from a2tg_jax import (
     Appearance,
     Bands,
-    Billboards,
     Exponents,
-    MovableKernels,
+    Model,
     Texture,
+    adam_init,
+    adam_update,
     allocate_appearance,
+    combine,
+    concatenate,
+    partition,
+    textures_from_arrays,
+    value_and_grad,
 )
+from a2tg_jax.appearance import Billboards, MovableKernels
 from a2tg_jax.appearance.base import check_appearance
 from a2tg_jax.appearance.parts import bands_of_dense
 from a2tg_jax.core.table import Table
 from a2tg_jax.events import gather_moments, gather_rows
-from a2tg_jax.model import Model
-from a2tg_jax.texture import textures_from_arrays
 
 NUM = 12
 SIZES = [(1, 1), (4, 2), (2, 2)]

@@ -20,23 +20,29 @@ import numpy as np
 import pytest
 from run_folders import create_run, some_result
 
-from a2tg_jax import Change, StepEvent, fit
+from a2tg_jax import (
+    Change,
+    DivergedError,
+    Gaussians2dMcmc,
+    Mcmc,
+    StepEvent,
+    fit,
+    load_checkpoint,
+    load_model,
+    pytree,
+    save_checkpoint,
+)
+from a2tg_jax.base.atomic import replacing, write_whole
+from a2tg_jax.base.machine import this_machine
+from a2tg_jax.base.regular_files import sha256_of
 from a2tg_jax.cli import main as cli, runs
-from a2tg_jax.core.pytree import pytree
 from a2tg_jax.host import signals
-from a2tg_jax.host.atomic import replacing, write_whole
 from a2tg_jax.host.errors import error_text
-from a2tg_jax.host.machine import this_machine
-from a2tg_jax.host.regular_files import sha256_of
-from a2tg_jax.io.model_file import load_model
-from a2tg_jax.mcmc import Mcmc
-from a2tg_jax.results import compression, forecast, run_evaluation, run_training
+from a2tg_jax.results import compression, forecast, run_evaluation, run_training, stage_training
 from a2tg_jax.results.folder import OLD, RunFolder, old_run, opened, put_back_old, set_aside
 from a2tg_jax.results.output_paths import check_apart
 from a2tg_jax.results.record import RunRecord, SceneSource, read_record, read_run_file, write_record
 from a2tg_jax.results.run_training import MOST_RESTORED, RunOptions, train_run
-from a2tg_jax.systems.baselines import Gaussians2dMcmc
-from a2tg_jax.training import DivergedError, load_checkpoint, save_checkpoint
 from a2tg_jax.training.batches import BatchOrder
 from a2tg_jax.training.loop import StageRun
 
@@ -203,7 +209,7 @@ def test_the_error_of_a_full_disk_names_the_file(tmp_path, monkeypatch, capsys, 
 def test_a_second_process_is_refused_and_a_killed_one_holds_nothing(tmp_path, capsys):
     run = filled(tmp_path / "run")
     lock = (
-        "import sys\nfrom a2tg_jax.host.operating_system import try_lock\n"
+        "import sys\nfrom a2tg_jax.base.operating_system import try_lock\n"
         "file = open(sys.argv[1], 'a')\nprint(try_lock(file.fileno()), flush=True)\ninput()"
     )
     command = [sys.executable, "-c", lock, str(run.marker)]
@@ -246,7 +252,7 @@ def test_a_run_without_a_checkpoint_replaces_nothing(tmp_path, monkeypatch, caps
 def test_a_replacement_that_was_stopped_keeps_the_old_run_and_continues(tmp_path, monkeypatch, capsys):
     run = filled(tmp_path / "run")
     with monkeypatch.context() as patch:
-        patch.setattr(run_training, "save_checkpoint", saving_until(4))
+        patch.setattr(stage_training, "save_checkpoint", saving_until(4))
         assert cli.main([*TRAIN, "--seed", "5", "--out", str(run.path), "--overwrite"]) == 130
     assert f"{NAME}-0000000004.npz; continue with: a2tg train --out {run.path} --resume" in capsys.readouterr().err
     kept = old_run(run)
@@ -314,7 +320,7 @@ def stopped(scene, tmp_path_factory):
         run = create_run(folder / name)
         write_record(run, RECORD)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(run_training, "save_checkpoint", function)
+            patch.setattr(stage_training, "save_checkpoint", function)
             with contextlib.suppress(KeyboardInterrupt):
                 train_run(run, scene, QUIET)
     return RunFolder(folder / "run"), load_model(RunFolder(folder / "whole").model(NAME))
@@ -442,7 +448,7 @@ def test_restoring_takes_another_order_and_resuming_repeats_it(scene, tmp_path, 
     other, numbers = trapped_run(scene, tmp_path / "other", "restore"), []
     with monkeypatch.context() as patch, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        patch.setattr(run_training, "save_checkpoint", saving_until(8, 14, noted=numbers))
+        patch.setattr(stage_training, "save_checkpoint", saving_until(8, 14, noted=numbers))
         for _ in range(2):
             with pytest.raises(KeyboardInterrupt):
                 train_run(other, scene, QUIET)
@@ -510,7 +516,7 @@ def test_a_second_signal_ends_the_program_at_once():
 
 
 def test_errors_of_training_come_with_advice(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(run_training, "save_checkpoint", raising(OSError(28, "No space left on device")))
+    monkeypatch.setattr(stage_training, "save_checkpoint", raising(OSError(28, "No space left on device")))
     assert cli.main([*TRAIN, "--out", str(tmp_path / "run")]) == 2
     error = capsys.readouterr().err.splitlines()[-1]
     printed = "the disk is full: make room, or write to another disk"

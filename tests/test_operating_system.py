@@ -17,7 +17,8 @@ from scenes_random import as_camera, as_gaussians, draw_scene
 
 import a2tg_jax
 from a2tg_jax import render_image
-from a2tg_jax.host import machine, operating_system, signals
+from a2tg_jax.base import machine, operating_system
+from a2tg_jax.host import signals
 from a2tg_jax.rasterize.kernels.native import composite as native, ffi
 
 ROOT = Path(__file__).parents[1]

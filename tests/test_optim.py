@@ -9,7 +9,8 @@ import pytest
 from small_models import some_gaussians
 
 import a2tg_jax as a2tg
-from a2tg_jax.core.optim import OptStep, adam_init, adam_update, exponential_decay
+from a2tg_jax import adam_init, adam_update, exponential_decay
+from a2tg_jax.core.optim import OptStep
 from a2tg_jax.training.step import initial_state, optimized
 
 

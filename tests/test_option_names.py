@@ -7,9 +7,10 @@ import pytest
 from toy_system import Shrink, Toy
 
 import a2tg_jax as a2tg
+from a2tg_jax import find_system
+from a2tg_jax.core.config_json import changed_config, flatten_config
 from a2tg_jax.events import Event
-from a2tg_jax.io.config_json import changed_config, flatten_config
-from a2tg_jax.training.registry import SYSTEMS, find_system
+from a2tg_jax.training.registry import SYSTEMS
 
 WITH_AND_WITHOUT = pytest.mark.parametrize("budget", [None, "9MB"])
 ALL = pytest.mark.parametrize("name", SYSTEMS)

@@ -19,8 +19,7 @@ import pytest
 from PIL import Image
 from small_values import some_gaussians
 
-from a2tg_jax import Model, load_ply, load_splats, save_splats
-from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax import Gaussians, Model, load_ply, load_splats, save_splats
 
 OTHERS = Path(__file__).parent / "data" / "others"
 NUM, C0 = 90, 1 / (2 * np.sqrt(np.pi))

@@ -9,12 +9,11 @@ from PIL import Image, PngImagePlugin
 from scipy.ndimage import map_coordinates
 from test_data_sfm import cameras_of, staged
 
+from a2tg_jax import load_scene, with_validation_views
 from a2tg_jax.core.cameras import looking
 from a2tg_jax.data import synthetic
-from a2tg_jax.data.assembly import with_validation_views
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.decoding import picture_facts
-from a2tg_jax.data.load import load_scene
 from a2tg_jax.data.panoramas import projection_of
 from a2tg_jax.data.staging import cut_view, directions, view_size
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from a2tg_jax.core.camera_paths import central_camera, look_at, path_through, turntable, vertical_of
-from a2tg_jax.core.cameras import Camera, looking
+from a2tg_jax import Camera, look_at, path_through
+from a2tg_jax.core.camera_paths import central_camera, turntable, vertical_of
+from a2tg_jax.core.cameras import looking
 from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.io.path_file import load_views
 

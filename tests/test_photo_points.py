@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial import cKDTree
 
 import a2tg_jax as a2tg
+from a2tg_jax import Mask, Picture
 from a2tg_jax.data.photo_points import Look, agreeing_points
-from a2tg_jax.data.photo_store import Mask, Picture
 
 
 def looks_of(views):

@@ -10,13 +10,10 @@ from bits import bits_of
 from kept_checkpoints import fit_keeping_checkpoints
 
 import a2tg_jax as a2tg
+from a2tg_jax import Due, PlaceByError, View, adam_init, partition
 from a2tg_jax.core.gaussians import SH_C0, no_rows, rotation_matrices
-from a2tg_jax.core.optim import adam_init
 from a2tg_jax.core.origin import BLACK, WHITE, Color
-from a2tg_jax.core.pytree import partition
-from a2tg_jax.data.scene import View
-from a2tg_jax.densify.placing import OPACITY, PlaceByError, gaussians_at_errors
-from a2tg_jax.events import Due
+from a2tg_jax.densify.placing import OPACITY, gaussians_at_errors
 
 DEPTH, FOCAL, SIZE = 4.0, 20.0, (16, 24)
 K = np.array([[FOCAL, 0, 12], [0, FOCAL, 8], [0, 0, 1]], np.float32)

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from a2tg_jax import load_ply
 from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.data.ply import PlyFile
-from a2tg_jax.io.ply import load_ply, unpacked_vertices
+from a2tg_jax.io.ply import unpacked_vertices
 
 NUM = 300
 """More than a chunk, and no whole number of them."""

@@ -12,18 +12,17 @@ from on_processes import SHORT, ended, free_port, pair, started, survivor_of, tr
 from run_folders import create_run
 
 import a2tg_jax as a2tg
+from a2tg_jax import Session, fit_stage, load_model
+from a2tg_jax.base.archive import write_archive
+from a2tg_jax.base.machine import Devices
 from a2tg_jax.cli import main as cli
 from a2tg_jax.cli.processes import LOST, is_lost
 from a2tg_jax.cli.train import train_defaults
-from a2tg_jax.host.machine import Devices
-from a2tg_jax.io.archive import write_archive
-from a2tg_jax.io.model_file import load_model
 from a2tg_jax.results import run_processes
 from a2tg_jax.results.commands import resuming_command
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.history import read_history
 from a2tg_jax.results.record import RunRecord, SceneSource, read_record, write_record
-from a2tg_jax.training import Session, fit_stage
 
 
 @pytest.mark.long

@@ -14,13 +14,8 @@ from test_splitting import some_state
 from test_view_dependence import banded
 
 import a2tg_jax as a2tg
-from a2tg_jax.core.optim import adam_init
-from a2tg_jax.core.pytree import partition
-from a2tg_jax.data.scene import View
-from a2tg_jax.densify.pruning import Prune, shown_in
-from a2tg_jax.densify.splitting import SplitByGradient
-from a2tg_jax.events import Due
-from a2tg_jax.model import Model
+from a2tg_jax import Due, Model, Prune, SplitByGradient, View, adam_init, partition
+from a2tg_jax.densify.pruning import shown_in
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.start import initial_model
 
@@ -109,8 +104,8 @@ def test_degrees_stay_with_their_gaussians():
 def test_times_must_exist():
     for at in ((0.5, 0.2), (0.0,), (0.5, 1.1)):
         with pytest.raises(ValueError, match="above 0, up to 1"):
-            Prune(at=at).iterations(100)
-    assert Prune(at=(0.5, 1.0)).iterations(100) == (50, 100)
+            Prune(at=at).times(100)
+    assert Prune(at=(0.5, 1.0)).times(100) == (50, 100)
 
 
 def test_impossible_numbers_are_refused_before_training():
@@ -204,7 +199,7 @@ def test_default_times_suit_short_stages():
 def test_what_other_events_have_gathered_follows(scene):
     system = dataclasses.replace(SYSTEM, place=a2tg.PlaceByError(share=0.0))  # New Gaussians have gathered nothing.
     run = StageRun(scene, system, 0, initial_model(scene, system))
-    first = system.stages()[0].events[2].iterations(200)[0]
+    first = system.stages()[0].events[2].times(200)[0]
     run.steps(1, first)
     totals = {tuple(mean): total for mean, total in zip(*gathered(run), strict=True)}
     assert len(set(totals.values())) > 20

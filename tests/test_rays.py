@@ -13,16 +13,13 @@ from PIL import Image
 from scenes_random import CAPACITY, as_camera, as_gaussians, as_textures, draw_scene, fisheye
 
 import a2tg_jax as a2tg
-from a2tg_jax.appearance import Appearance
-from a2tg_jax.core.cameras import Camera, looking
-from a2tg_jax.data.scene import kinds_of, ray_bytes
-from a2tg_jax.densify.pruning import Prune
-from a2tg_jax.model import Model
-from a2tg_jax.rasterize.views import pairs_of_view
+from a2tg_jax import Appearance, Camera, Model, Prune, normal_consistency
+from a2tg_jax.core.cameras import looking
+from a2tg_jax.rasterize.room import most_pairs
+from a2tg_jax.scene import kinds_of, ray_bytes
 from a2tg_jax.training import batches
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.cost import fed_bytes
-from a2tg_jax.training.losses import normal_consistency
 
 WIDTH, HEIGHT = 43, 30
 BOTH = pytest.mark.parametrize("compositor", [pytest.param("xla", marks=pytest.mark.long), "native"])
@@ -149,7 +146,7 @@ def test_wide_lenses_make_a_few_times_the_pairs():
         log_scales=jnp.full((200, 2), np.log(0.01), jnp.float32),
     )
     settings = a2tg.RenderSettings()
-    of_pinhole, of_rays = (pairs_of_view(gaussians, seen, Appearance(), settings) for seen in (camera, wide))
+    of_pinhole, of_rays = (most_pairs(gaussians, [seen], Appearance(), settings) for seen in (camera, wide))
     assert of_pinhole > 200 and of_rays < 4 * of_pinhole
 
 

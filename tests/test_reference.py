@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from reference_files import FILES, NUM, SUMS, checksum, load, numbers, reference_model, shaped_model
 
-from a2tg_jax import save_splats
-from a2tg_jax.appearance import TextureOptions
+from a2tg_jax import TextureOptions, save_splats
 from a2tg_jax.io.compact import unframed
 from a2tg_jax.io.web_scene import encode_web_scene
 

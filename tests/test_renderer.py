@@ -6,13 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled_programs import compiled_programs
 from scenes_random import as_camera, as_gaussians, draw_scene
 
 import a2tg_jax as a2tg
-from a2tg_jax.core.cameras import Camera, crop_camera, resize_camera
-from a2tg_jax.core.gaussians import Gaussians
-from a2tg_jax.core.pytree import num_compiled
-from a2tg_jax.data.scene import View
+from a2tg_jax import Camera, Gaussians, View, resize_camera
+from a2tg_jax.core.cameras import crop_camera
 from a2tg_jax.render import jitted_render
 
 
@@ -33,12 +32,13 @@ def flight(num: int, size: tuple[int, int] = (48, 32)) -> list[Camera]:
 @pytest.mark.filterwarnings("ignore::a2tg_jax.EmptyRenderWarning")
 def test_a_flight_of_200_views_compiles_three_times_at_most():
     gaussians = cloud(2000)
-    renderer, before = a2tg.Renderer(gaussians, has_geometry=False), num_compiled(jitted_render())
+    renderer = a2tg.Renderer(gaussians, has_geometry=False)
     pairs = [a2tg.plan_render(gaussians, camera).capacity for camera in flight(20)]
     assert max(pairs) > 4 * pairs[0], "the flight is to need more room on its way"
-    frames = [(camera, renderer(camera)) for camera in flight(200)]
+    with compiled_programs("render_traced") as programs:
+        frames = [(camera, renderer(camera)) for camera in flight(200)]
     assert not any(output.overflow for _, output in frames)
-    assert 2 <= num_compiled(jitted_render()) - before <= 3
+    assert 2 <= len(programs) <= 3
     for camera, output in frames[39::40]:
         np.testing.assert_array_equal(output.color, a2tg.render_image(gaussians, camera).color)
 
@@ -53,22 +53,23 @@ def test_cameras_that_are_known_compile_once(are_given):
         else a2tg.Model(gaussians, origin=a2tg.Origin.of_cameras(flight(10, (20, 12))))
     )
     renderer = a2tg.Renderer(model, cameras=cameras if are_given else (), has_geometry=False)
-    before = num_compiled(jitted_render())
-    for camera in cameras:
-        renderer(camera)
-    assert num_compiled(jitted_render()) - before == 1
+    with compiled_programs("render_traced") as programs:
+        for camera in cameras:
+            renderer(camera)
+    assert len(programs) == 1
 
 
 def test_several_sizes_and_models_of_one_shape():
     cameras = [resize_camera(camera, *size) for camera in flight(4)[:3] for size in ((24, 16), (16, 24))]
     jitted_render().clear_cache()
-    for shift in (0.0, 0.1):
-        gaussians = dataclasses.replace(cloud(), means=cloud().means + shift)
-        renderer = a2tg.Renderer(gaussians, cameras=cameras, has_geometry=False)
-        for camera in cameras:
-            assert renderer(camera).color.shape == (camera.height, camera.width, 3)
-        assert set(renderer.capacities) == {(24, 16), (16, 24)}
-    assert num_compiled(jitted_render()) == 2
+    with compiled_programs("render_traced") as programs:
+        for shift in (0.0, 0.1):
+            gaussians = dataclasses.replace(cloud(), means=cloud().means + shift)
+            renderer = a2tg.Renderer(gaussians, cameras=cameras, has_geometry=False)
+            for camera in cameras:
+                assert renderer(camera).color.shape == (camera.height, camera.width, 3)
+            assert set(renderer.capacities) == {(24, 16), (16, 24)}
+    assert len(programs) == 2
 
 
 def test_a_model_with_all_that_belongs_to_it():

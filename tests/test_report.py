@@ -14,14 +14,10 @@ import numpy as np
 import pytest
 from run_folders import NAMES, circle, create_run, some_history, some_result
 
-from a2tg_jax.appearance import Appearance, Bands, Texture
+from a2tg_jax import Appearance, Bands, Geometry, Model, RenderOutput, Texture, init_from_points, textures_from_arrays
 from a2tg_jax.appearance.parts import empty_bands
-from a2tg_jax.core.gaussians import init_from_points
 from a2tg_jax.data.load import SceneSource
 from a2tg_jax.host.source_commit import source_commit
-from a2tg_jax.model import Model
-from a2tg_jax.rasterize.render_types import Geometry
-from a2tg_jax.render import RenderOutput
 from a2tg_jax.results.figures import (
     TEXTURE_SIDE,
     ReportFigure,
@@ -37,7 +33,6 @@ from a2tg_jax.results.figures import (
 from a2tg_jax.results.images import error_picture, largest_gain, side_by_side, to_uint8
 from a2tg_jax.results.report import Comparison, ModelResult, write_report
 from a2tg_jax.results.run_evaluation import is_split_by_number
-from a2tg_jax.texture import textures_from_arrays
 
 
 def written_report(folder, result, *, view="a", captions=("b",), figures=(), **options) -> str:

@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from a2tg_jax.host.machine import Machine, this_machine
+from a2tg_jax.base.machine import Machine, this_machine
 from a2tg_jax.rasterize.kernels import platforms
 
 

@@ -13,15 +13,25 @@ from scenes_random import as_camera, as_gaussians, draw_scene
 from small_models import some_model, with_row
 
 import a2tg_jax as a2tg
-from a2tg_jax.appearance import Appearance, Bands, Exponents, Texture, allocate_appearance
-from a2tg_jax.data.scene import Scene, View
-from a2tg_jax.measure.evaluation import Evaluation, ViewMetrics
-from a2tg_jax.model import Model
-from a2tg_jax.rasterize.render_types import Geometry
-from a2tg_jax.render import RenderOutput
-from a2tg_jax.systems.a2tg import A2tg
-from a2tg_jax.training.checkpoint import Checkpoint, History
-from a2tg_jax.training.fitting import FitResult, StageResult
+from a2tg_jax import (
+    A2tg,
+    Appearance,
+    Bands,
+    Checkpoint,
+    Evaluation,
+    Exponents,
+    FitResult,
+    Geometry,
+    History,
+    Model,
+    RenderOutput,
+    Scene,
+    StageResult,
+    Texture,
+    View,
+    ViewMetrics,
+    allocate_appearance,
+)
 from a2tg_jax.training.step import TrainState
 
 CAMERA = as_camera(draw_scene(0, width=21, height=13), "float32")

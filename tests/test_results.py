@@ -18,21 +18,33 @@ from run_folders import NAMES, RECORD, circle, create_run, some_history, some_re
 from small_models import with_row
 
 import a2tg_jax as a2tg
-from a2tg_jax.adapt import Upscale
-from a2tg_jax.appearance import MovableKernels, allocate_appearance
+from a2tg_jax import (
+    A2tg,
+    BBSplat,
+    Bytewise,
+    Gaussians2d,
+    Gaussians2dMcmc,
+    LearningRates,
+    Mcmc,
+    Model,
+    TexturedGaussians,
+    Upscale,
+    View,
+    allocate_appearance,
+    evaluate,
+    init_from_points,
+    like,
+    psnr,
+    render_image,
+    save_model,
+    smooth_path,
+    synthetic_scene,
+    view_image,
+)
+from a2tg_jax.appearance import MovableKernels
+from a2tg_jax.base.text import in_bytes
 from a2tg_jax.cli import main as cli, runs
-from a2tg_jax.core.camera_paths import smooth_path
-from a2tg_jax.core.gaussians import init_from_points
-from a2tg_jax.data.scene import View, origin_of_scene, view_image
-from a2tg_jax.data.synthetic import synthetic_scene
-from a2tg_jax.host.text import in_bytes
-from a2tg_jax.io.model_file import save_model
-from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.measure import evaluation
-from a2tg_jax.measure.evaluation import evaluate
-from a2tg_jax.measure.metrics import psnr
-from a2tg_jax.model import Model
-from a2tg_jax.render import render_image
 from a2tg_jax.results.commands import repeating_command
 from a2tg_jax.results.folder import OLD, RunFolder, check_free, drop_old, open_run, set_aside
 from a2tg_jax.results.history import EventWriter, read_history, write_history
@@ -52,10 +64,7 @@ from a2tg_jax.results.report import (
 )
 from a2tg_jax.results.run_evaluation import check_held_out, evaluate_run
 from a2tg_jax.results.run_training import RunOptions, train_run
-from a2tg_jax.systems.a2tg import A2tg
-from a2tg_jax.systems.baselines import BBSplat, Gaussians2d, Gaussians2dMcmc, TexturedGaussians
-from a2tg_jax.systems.bytewise import Bytewise
-from a2tg_jax.training import LearningRates, like
+from a2tg_jax.scene import origin_of_scene
 
 needs_tensorboard = pytest.mark.skipif(
     importlib.util.find_spec("tensorboardX") is None, reason="the extra [tensorboard] is not installed"
@@ -464,8 +473,8 @@ def test_shared_stages_are_trained_once():
         "density-continued",
     )  # fmt: skip
     assert plan.chains["fixed"] == ("main-gaussians", "fixed-textures")
-    assert [planned.start for planned in plan.stages][1:4] == ["main-gaussians"] * 3
-    assert plan.first_iteration("density-continued") == 1_500
+    assert [planned.start for planned in plan.stages][1:4] == [plan["main-gaussians"]] * 3
+    assert plan["density-continued"].first_iteration == 1_500
     shaped = A2tg.preset("quick")
     plan = plan_run({"main": shaped, "baseline": like(Gaussians2dMcmc, shaped)})
     assert plan.chains["baseline"] == ("baseline-gaussians", "baseline-continued"), "plain Gaussians have no shapes"

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from small_values import assert_same, some_gaussians, some_world
 
-from a2tg_jax import Model, load_splats, save_splats
+from a2tg_jax import Model, load_splats, save_splats, transform_gaussians
 from a2tg_jax.core.gaussians import rotation_matrices
-from a2tg_jax.core.similarity import transform_gaussians
 
 SUFFIXES = [".ply", ".ksplat", ".glb", ".splat"]
 OTHERS = np.array([0, 1, 3, 4, 5, 6])

@@ -19,8 +19,8 @@ from test_data_transforms import (
     write_scene,
 )
 
+from a2tg_jax import load_scene
 from a2tg_jax.data.image_files import find_image, inside, on_disk
-from a2tg_jax.data.load import load_scene
 
 KEPT = 5
 """Rows at the top that masks exclude."""

@@ -12,8 +12,8 @@ import pytest
 from PIL import Image
 
 import a2tg_jax as a2tg
-from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.results.model_source import Source
+from a2tg_jax.scene import origin_of_scene
 
 ROOT = pathlib.Path(__file__).parents[1]
 sys.path.append(str(ROOT))  # Last, so that the installed package comes first.

@@ -9,22 +9,24 @@ import pytest
 from run_folders import circle
 
 import a2tg_jax as a2tg
-from a2tg_jax.appearance import (
+from a2tg_jax import (
     Appearance,
     Bands,
     Exponents,
-    MovableKernels,
+    Model,
     Texture,
     TextureOptions,
+    View,
     allocate_appearance,
-    template_of,
+    init_from_points,
+    shrink_textures,
+    texture_arrays,
+    textures_from_arrays,
 )
-from a2tg_jax.core.gaussians import SH_C0, init_from_points
-from a2tg_jax.data.scene import View
-from a2tg_jax.finish.shrinking import halve_textures, shrink_textures, taken, texel_weights
-from a2tg_jax.model import Model
+from a2tg_jax.appearance import MovableKernels, template_of
+from a2tg_jax.core.gaussians import SH_C0
+from a2tg_jax.finish.shrinking import halve_textures, taken, texel_weights
 from a2tg_jax.results.images import to_uint8
-from a2tg_jax.texture import texture_arrays, textures_from_arrays
 
 NUM = 12
 BACKGROUND = (0.2, 0.3, 0.1)

@@ -11,20 +11,10 @@ from small_models import some_now
 from test_mcmc import random_gaussians
 
 import a2tg_jax as a2tg
+from a2tg_jax import AdamState, GradientStatistics, Model, Seen, SplitByGradient, adam_init, partition
 from a2tg_jax.core.gaussians import rotation_matrices
-from a2tg_jax.core.optim import AdamState, adam_init
-from a2tg_jax.core.pytree import partition
-from a2tg_jax.densify.splitting import (
-    SplitByGradient,
-    SplitStatistics,
-    draw_distinct_hosts,
-    draw_weights,
-    logits_of_halves,
-    split_rows,
-)
-from a2tg_jax.events import GradientStatistics, Seen, Times
+from a2tg_jax.densify.splitting import SplitStatistics, draw_distinct_hosts, draw_weights, logits_of_halves, split_rows
 from a2tg_jax.mcmc import plan_growth, plan_relocation
-from a2tg_jax.model import Model
 
 NUM, LIVE = 400, 300
 KEY = jax.random.key(0)
@@ -169,10 +159,10 @@ def test_the_dead_are_moved_onto_halves():
 
 def test_the_last_event_leaves_the_cap():
     model, moments, statistics = some_state()
-    event, times = SplitByGradient(390), Times(10, 40, 10)
+    event = SplitByGradient(390)
     counts = []
-    for iteration in (10, 20, 30, 40):
-        change = event.apply(some_now(iteration, 50, times, num_keys=2), model, moments, statistics)
+    for num_left, iteration in ((4, 10), (3, 20), (2, 30), (1, 40)):
+        change = event.apply(some_now(iteration, 50, num_left, num_keys=2), model, moments, statistics)
         model, moments, statistics = change.model, change.moments, change.state
         counts.append(int(model.num_live))
     assert counts == sorted(counts) and counts[-1] == 390 and counts[0] > LIVE

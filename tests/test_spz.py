@@ -13,8 +13,7 @@ import zstandard
 from small_values import some_gaussians
 from test_others import OTHERS, numbers
 
-from a2tg_jax import Model, load_splats, save_splats
-from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax import Gaussians, Model, load_splats, save_splats
 
 SCENE = (OTHERS / "scene.spz").read_bytes()
 AXES = ["LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF", "LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import a2tg_jax as a2tg
-from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax import Gaussians
 from a2tg_jax.training.start import fainter_where_dense, initial_model, wider_where_dense
 
 FOCAL, DEPTH = 100.0, 2.0

@@ -9,14 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled_programs import compiled_programs
 from small_models import some_model
 from toy_system import Toy
 
 import a2tg_jax as a2tg
-from a2tg_jax.core.optim import adam_init
-from a2tg_jax.core.pytree import combine, num_compiled, partition
-from a2tg_jax.io.config_json import changed_config
-from a2tg_jax.training import fit_stage
+from a2tg_jax import adam_init, combine, fit_stage, partition
+from a2tg_jax.core.config_json import changed_config
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.options import own_options
@@ -185,7 +184,7 @@ def test_textured_gaussians_are_a2tg_with_one_size_and_no_events():
 def test_textures_reach_their_cap(cap):
     """As many upscalings as doublings; those that are chosen each time become cap × cap."""
     event = a2tg.Upscale(cap=cap, fraction=1.0, anisotropic=False)
-    times = event.iterations(30_000)
+    times = event.times(30_000)
     assert times == tuple(500 * (index + 1) for index in range(cap.bit_length() - 1))
     model = dataclasses.replace(some_model(), num_live=jnp.int32(12))
     moments = adam_init(partition(model)[0])
@@ -397,13 +396,14 @@ def test_a_sweep_compiles_each_step_once(scene, name, event, thresholds):
     if name == "a2tg":
         fixed["texture"] = {"at": [0.5]}
     for changes in [*VARIANTS, *({event: threshold} for threshold in thresholds)]:
-        before, rooms = num_compiled(jitted_step()), copy.deepcopy(session.capacities)
+        rooms = copy.deepcopy(session.room)
         merged = {key: {**fixed.get(key, {}), **changes.get(key, {})} for key in ("loss", "texture")}
         merged = {**changes, **{key: value for key, value in merged.items() if value}}
-        result = a2tg.fit(scene, tiny(name, **merged), progress=False, session=session)
+        with compiled_programs("train_step") as programs:
+            result = a2tg.fit(scene, tiny(name, **merged), progress=False, session=session)
         # Lists that grow in the middle of a run are compiled again; a run records how often that was.
-        count = max(0, num_compiled(jitted_step()) - before - result.num_regrown)
-        counts.append((count, session.capacities == rooms))
+        count = max(0, len(programs) - result.num_regrown)
+        counts.append((count, session.room == rooms))
         scales.append(float(jnp.mean(result.stages[0].model.gaussians.scales)))
     # So are lists that must be longer from the start, as where a seed puts more splats on the screen. The events of
     # another rule (select) are another program.

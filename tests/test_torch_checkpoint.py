@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 from small_values import assert_same, some_gaussians, some_world
 
-from a2tg_jax import Model, load_splats, save_splats, to_gsplat
-from a2tg_jax.core.gaussians import Gaussians
-from a2tg_jax.core.origin import Origin
+from a2tg_jax import Gaussians, Model, Origin, load_splats, save_splats, to_gsplat
 
 
 class PlainUnpickler(pickle.Unpickler):

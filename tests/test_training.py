@@ -8,33 +8,42 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from bits import bits_of
+from compiled_programs import compiled_programs
 from kept_checkpoints import fit_keeping_checkpoints
 from own_process import passes_in_its_own_process
 from small_models import with_row
 
 from a2tg_jax import (
     A2tg,
+    Appearance,
     Change,
     Checkpoint,
+    CloneSplitPrune,
+    Gaussians2d,
+    Gaussians2dMcmc,
     Interrupted,
+    LossConfig,
+    Mcmc,
     RenderSettings,
+    Session,
+    Stage,
     StepEvent,
     Term,
+    Texture,
+    Upscale,
+    allocate_appearance,
     fit,
+    fit_stage,
+    like,
     load_checkpoint,
+    pytree,
     save_checkpoint,
     ssim,
     synthetic_scene,
     view_image,
 )
-from a2tg_jax.adapt import Upscale
-from a2tg_jax.appearance import Appearance, Texture, allocate_appearance
-from a2tg_jax.core.pytree import num_compiled, pytree
 from a2tg_jax.core.table import Shape
-from a2tg_jax.densify.clone_split import CloneSplitPrune
-from a2tg_jax.mcmc import Mcmc
-from a2tg_jax.systems.baselines import Gaussians2d, Gaussians2dMcmc
-from a2tg_jax.training import LossConfig, Session, Stage, fit_stage, like, loop
+from a2tg_jax.training import loop
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.start import initial_model, padded
 from a2tg_jax.training.step import jitted_step
@@ -59,8 +68,9 @@ def scene():
 def trained(scene):
     """A whole run, its checkpoints, and how many traces it took."""
     jitted_step().clear_cache()
-    result, checkpoints = fit_keeping_checkpoints(scene, CONFIG)
-    return result, checkpoints, num_compiled(jitted_step())
+    with compiled_programs("train_step") as programs:
+        result, checkpoints = fit_keeping_checkpoints(scene, CONFIG)
+    return result, checkpoints, len(programs)
 
 
 def assert_same(a, b):
@@ -210,18 +220,17 @@ def test_events_that_the_host_decides_are_those_of_the_step(scene, trained, monk
 
     def states():
         run = StageRun(scene, CONFIG, 0, initial_model(scene, CONFIG))
-        times = next(times for times in run.clock.times if times is not None)
-        due = next(iteration for iteration in range(1, run.stage.iterations) if times.is_due(iteration))
+        due = min(times[0] for times in run.stage.times if len(times) < run.stage.iterations)
         for iteration in range(1, due + 2):
             run.steps(iteration, iteration)
             yield run.state.model
 
     decided_inside = [jax.tree.map(np.array, model) for model in states()]
     monkeypatch.setattr(loop, "are_events_decided_by_host", lambda state: True)
-    before = num_compiled(jitted_step())
-    for own, other in zip(states(), decided_inside, strict=True):
-        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), own, other)
-    assert num_compiled(jitted_step()) - before == 2
+    with compiled_programs("train_step") as programs:
+        for own, other in zip(states(), decided_inside, strict=True):
+            jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), own, other)
+    assert len(programs) == 2
     numbers = [int(model.live_count) for model in decided_inside]
     assert len(set(numbers)) == 2 and numbers[-1] == numbers[-2] > numbers[-3]
 

@@ -12,28 +12,37 @@ from test_compact import MODELS, SETTINGS, order_of
 from test_compaction import SCENE, a_model
 
 import a2tg_jax as a2tg
-from a2tg_jax.appearance import Appearance, Exponents, allocate_appearance, files
+from a2tg_jax import (
+    Appearance,
+    CompactChoices,
+    DivergedError,
+    Exponents,
+    Model,
+    Scene,
+    Trial,
+    Tuned,
+    allocate_appearance,
+    evaluate,
+    loss_on_views,
+    tune_compact,
+)
+from a2tg_jax.appearance import files
 from a2tg_jax.core.cameras import moved_viewmat
-from a2tg_jax.data.scene import Scene, origin_of_scene
 from a2tg_jax.finish import tuning
-from a2tg_jax.finish.compaction import TooLargeError, Trial, loss_on_views
+from a2tg_jax.finish.compaction import TooLargeError
 from a2tg_jax.finish.tuning import (
     MOST_TUNINGS,
     TUNED_LADDER,
     GradualRounding,
     GridRounding,
-    Tuned,
     TunedFiles,
     best_tuned,
     partly_rounded,
     smallest_tuned,
-    tune_compact,
 )
-from a2tg_jax.io.compact import GROUPS, CompactChoices, decode_model, encode_model, grids_of, half_turned
-from a2tg_jax.measure.evaluation import evaluate
-from a2tg_jax.model import Model
+from a2tg_jax.io.compact import GROUPS, decode_model, encode_model, grids_of, half_turned
 from a2tg_jax.results.run_evaluation import refined_views
-from a2tg_jax.training import DivergedError
+from a2tg_jax.scene import origin_of_scene
 from a2tg_jax.training.corrections import exposed
 
 COARSE = CompactChoices(

@@ -11,14 +11,14 @@ from run_folders import create_run
 from small_models import some_checkpoint, some_model, write_random_squeeze
 
 import a2tg_jax as a2tg
+from a2tg_jax.base.atomic import write_whole
+from a2tg_jax.base.json_text import read_json
 from a2tg_jax.cli.main import main, parsed
 from a2tg_jax.data.colmap_files import read_file
 from a2tg_jax.data.decoding import picture_facts, read_pixels
 from a2tg_jax.data.photo_reading import read_depths
 from a2tg_jax.data.ply import read_ply_points
 from a2tg_jax.data.video import extract_frames
-from a2tg_jax.host.atomic import write_whole
-from a2tg_jax.host.json_text import read_json
 from a2tg_jax.io.formats import FORMATS, format_of
 from a2tg_jax.results.folder import write_json
 from a2tg_jax.results.record import read_run_file

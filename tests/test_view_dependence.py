@@ -10,21 +10,37 @@ import pytest
 from scenes_random import as_camera, as_gaussians, draw_scene
 from scipy.spatial.transform import Rotation
 
-from a2tg_jax import Appearance, Model, Texture, load_model, load_ply, plan_render, save_model, save_ply
-from a2tg_jax.appearance import Bands, Billboards, Exponents, MovableKernels, allocate_appearance, template_of
+from a2tg_jax import (
+    AdaptDegrees,
+    Appearance,
+    Bands,
+    Due,
+    Exponents,
+    Gaussians2dMcmc,
+    LearningRates,
+    Mcmc,
+    Model,
+    Seen,
+    Similarity,
+    Stage,
+    Texture,
+    adam_init,
+    allocate_appearance,
+    combine,
+    load_model,
+    load_ply,
+    partition,
+    plan_render,
+    save_model,
+    save_ply,
+)
+from a2tg_jax.appearance import Billboards, MovableKernels, template_of
 from a2tg_jax.appearance.parts import bands_of_dense, dense_bands, empty_bands, floats_of_band, sizes_of_degrees
+from a2tg_jax.base.archive import read_archive, write_archive
 from a2tg_jax.core.budget import within_budget
-from a2tg_jax.core.optim import adam_init
-from a2tg_jax.core.pytree import combine, partition
-from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.core.table import Shape, bucket_capacity, resize
-from a2tg_jax.densify.view_dependence import AdaptDegrees, ViewDependence, most_blocks, raised_degrees, without_idle
-from a2tg_jax.events import Due, Seen
-from a2tg_jax.io.archive import read_archive, write_archive
-from a2tg_jax.io.model_file import FORMAT
-from a2tg_jax.mcmc import Mcmc
-from a2tg_jax.systems.baselines import Gaussians2dMcmc
-from a2tg_jax.training import LearningRates, Stage
+from a2tg_jax.densify.view_dependence import ViewDependence, most_blocks, raised_degrees, without_idle
+from a2tg_jax.model_file import FORMAT
 from a2tg_jax.training.start import padded
 
 NUM = 40

@@ -25,23 +25,18 @@ from run_folders import create_run
 from small_values import some_gaussians
 from test_compact import textured
 
+from a2tg_jax import A2tg, Origin, Similarity, save_compact, save_model, save_ply, synthetic_scene
 from a2tg_jax.appearance import parts
+from a2tg_jax.base.text import in_bytes
 from a2tg_jax.cli.main import main
-from a2tg_jax.core.origin import Origin
-from a2tg_jax.core.similarity import Similarity
-from a2tg_jax.data.scene import origin_of_scene
-from a2tg_jax.data.synthetic import synthetic_scene
-from a2tg_jax.host.text import in_bytes
-from a2tg_jax.io.compact import save_compact, unframed
-from a2tg_jax.io.model_file import save_model
-from a2tg_jax.io.ply import save_ply
+from a2tg_jax.io.compact import unframed
 from a2tg_jax.results import viewing
 from a2tg_jax.results.compression import loss_measures
 from a2tg_jax.results.meshing import MeshOptions, write_mesh
 from a2tg_jax.results.model_source import Source, open_source
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record
 from a2tg_jax.results.viewing import ServedPhotographs, export_comparison, export_web, routes_of
-from a2tg_jax.systems.a2tg import A2tg
+from a2tg_jax.scene import origin_of_scene
 from a2tg_jax.web import server
 from a2tg_jax.web.page import viewer_html, viewer_html_with
 from a2tg_jax.web.server import ANY, Door, Route, application, lan_address, serve, served

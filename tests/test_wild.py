@@ -11,13 +11,11 @@ from scenes_random import as_camera, as_gaussians, draw_scene
 from test_data_colmap import HEIGHT, WIDTH, write_scene
 
 import a2tg_jax as a2tg
-from a2tg_jax.core.optim import adam_init
+from a2tg_jax import BilateralGrid, Due, Geometry, adam_init
 from a2tg_jax.data.photo_reading import find_depths, read_depths
 from a2tg_jax.densify.pruning import are_near, shown_in
-from a2tg_jax.events import Due
-from a2tg_jax.rasterize.render_types import Geometry
 from a2tg_jax.training.batches import stack_views
-from a2tg_jax.training.corrections import BilateralGrid, exposed, learned, sliced, total_variation
+from a2tg_jax.training.corrections import exposed, learned, sliced, total_variation
 from a2tg_jax.training.start import initial_model
 from a2tg_jax.training.terms import DepthPrior, Photometric, RobustPhotometric, depth_loss, inliers, scale_and_shift
 

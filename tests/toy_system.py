@@ -37,7 +37,7 @@ class Shrink(a2tg.StepEvent):
     factor: float = 0.9
 
     def times(self, num_iterations):
-        return a2tg.Times(first=5, last=num_iterations, every=5)
+        return range(5, num_iterations + 1, 5)
 
     def apply(self, now, model, moments, state):
         log_scales = model.gaussians.log_scales

@@ -14,18 +14,24 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.appearance import Appearance, Bands, Exponents, Texture, TextureOptions
+from a2tg_jax import (
+    Appearance,
+    Bands,
+    Camera,
+    Exponents,
+    Gaussians,
+    Model,
+    Origin,
+    Renderer,
+    RenderOutput,
+    Texture,
+    TextureOptions,
+    textures_from_arrays,
+)
 from a2tg_jax.appearance.parts import bands_of_dense
-from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.gaussians import Gaussians
-from a2tg_jax.core.origin import Origin
 from a2tg_jax.io.compact import decode_model
 from a2tg_jax.io.web_scene import encode_web_scene
-from a2tg_jax.model import Model
-from a2tg_jax.render import RenderOutput
-from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.model_source import Source
-from a2tg_jax.texture import textures_from_arrays
 
 NUM = 300
 """More than a chunk."""

@@ -20,8 +20,8 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
-from a2tg_jax.host.regular_files import expanded
-from a2tg_jax.host.text import defaulting_to
+from a2tg_jax.base.regular_files import expanded
+from a2tg_jax.host.command_words import defaulting_to
 
 Parsed = TypeVar("Parsed")
 

@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from a2tg_jax.base.machine import VARIABLE, memory_limit, num_threads
+from a2tg_jax.base.operating_system import cuda_of_driver
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians, init_from_points
 from a2tg_jax.core.numerics import MOST_DIFFERENCE, relative_difference
-from a2tg_jax.host.machine import VARIABLE, memory_limit, num_threads
-from a2tg_jax.host.operating_system import cuda_of_driver
 from a2tg_jax.host.startup import compilation_cache_folder
 from a2tg_jax.rasterize.kernels import platforms
 from a2tg_jax.rasterize.render_types import RenderSettings

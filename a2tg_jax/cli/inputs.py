@@ -8,13 +8,14 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from a2tg_jax.base.text import did_you_mean
 from a2tg_jax.data.download import BENCHMARK_SETS, fetch
 from a2tg_jax.data.load import is_scene
 from a2tg_jax.data.photo_folder import CAMERA_PICTURE, holds_photos
 from a2tg_jax.data.sfm import CameraModel, Matching, run_sfm
 from a2tg_jax.data.staging import Panorama
 from a2tg_jax.data.video import DEFAULT_FRAMES
-from a2tg_jax.host.text import defaulting_to, did_you_mean
+from a2tg_jax.host.command_words import defaulting_to
 from a2tg_jax.results.commands import quick_flags
 from a2tg_jax.results.figures import save_camera_picture
 from a2tg_jax.results.output_paths import check_apart, check_output

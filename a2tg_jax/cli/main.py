@@ -11,11 +11,11 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from typing import Any
 
+from a2tg_jax.base.machine import check_ulimits
+from a2tg_jax.base.text import did_you_mean, shortened
 from a2tg_jax.host import signals
 from a2tg_jax.host.errors import error_text
-from a2tg_jax.host.machine import check_ulimits
 from a2tg_jax.host.startup import configure_cpu
-from a2tg_jax.host.text import did_you_mean, shortened
 
 BROKEN_PIPE = 128 + 13  # The number of SIGPIPE, which Windows lacks.
 LONGEST_ERROR = 1000

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 from jax.experimental import multihost_utils
 
-from a2tg_jax.host.text import shortened
+from a2tg_jax.base.text import shortened
 from a2tg_jax.parallel import leave
 
 AUTO = "auto"

@@ -7,10 +7,11 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from a2tg_jax.base.regular_files import is_regular
+from a2tg_jax.base.text import counted
 from a2tg_jax.cli.arguments import EditFile, LastModel, LpipsWeights, RunFolderPath, RunOrFile
 from a2tg_jax.cli.train import open_browser, print_result
-from a2tg_jax.host.regular_files import is_regular
-from a2tg_jax.host.text import counted, defaulting_to
+from a2tg_jax.host.command_words import defaulting_to
 from a2tg_jax.io.formats import splats_at
 from a2tg_jax.mesh.files import mesh_files
 from a2tg_jax.results.compression import CompressOptions, compress

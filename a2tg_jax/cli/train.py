@@ -17,16 +17,16 @@ from tyro.conf import Positional, arg
 from tyro.constructors import StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
 from a2tg_jax.adapt import Upscale
+from a2tg_jax.base.machine import tidy_memory
+from a2tg_jax.base.operating_system import has_display
+from a2tg_jax.base.regular_files import expanded
+from a2tg_jax.base.text import counted
 from a2tg_jax.cli.arguments import LpipsWeights
 from a2tg_jax.cli.processes import AUTO, ProcessPlace, joined
 from a2tg_jax.core.budget import budget_in_bytes
+from a2tg_jax.core.config_json import flatten_config
 from a2tg_jax.data.load import SceneSource
-from a2tg_jax.data.scene import Scene
-from a2tg_jax.host.machine import tidy_memory
-from a2tg_jax.host.operating_system import has_display
-from a2tg_jax.host.regular_files import expanded
-from a2tg_jax.host.text import counted, defaulting_to
-from a2tg_jax.io.config_json import flatten_config
+from a2tg_jax.host.command_words import defaulting_to
 from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.results.commands import file_command, resuming_command
 from a2tg_jax.results.folder import RunFolder, open_run, opened
@@ -44,6 +44,7 @@ from a2tg_jax.results.report import RunResult, sizes_line, summary_text
 from a2tg_jax.results.run_processes import check_batch_sizes, follow_first_process
 from a2tg_jax.results.run_training import RunOptions, begin_run, resume_run, unseen, warn
 from a2tg_jax.results.viewing import shown_live
+from a2tg_jax.scene import Scene
 from a2tg_jax.systems.a2tg import A2tg
 from a2tg_jax.training import Session
 from a2tg_jax.training.loop import Watch

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from a2tg_jax.base.text import shortened
 from a2tg_jax.core.gaussians import floats_per_gaussian
 from a2tg_jax.core.numerics import Integer
-from a2tg_jax.host.text import shortened
 
 BYTES_PER_FLOAT = 4
 MEGABYTE = 10**6

@@ -6,14 +6,17 @@ value of a scalar array that is no tracer.
 
 import contextlib
 import dataclasses
+import math
 import numbers
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
+
+from a2tg_jax.base.text import shortened
 
 LARGEST_NUMBER = 1e12
 """Largest magnitude of numbers in geometry. In float32, their products with focal lengths, the squares of these, and
@@ -232,3 +235,55 @@ def short_repr(value: Any) -> str:
 
 def _written(shape: tuple[int | str, ...]) -> str:
     return f"[{', '.join(str(side) for side in shape)}]"
+
+
+def check_finite(name: str, tree: object, *, is_signed: bool = True) -> None:
+    """Raise ValueError, naming the leaf, if a float of a pytree is NaN or infinite or, unsigned, NaN or negative."""
+    for leaf, values in _float_rows(name, tree):
+        # `values >= 0` is False for NaN.
+        is_good: np.ndarray = np.all(np.isfinite(values) if is_signed else values >= 0, axis=1)
+        if not is_good.all():
+            wanted = "finite" if is_signed else "at least 0"
+            unwanted = "NaN or infinite" if is_signed else "negative or NaN"
+            bad = np.flatnonzero(~is_good)
+            raise ValueError(
+                f"{leaf} must be {wanted}; {len(bad):,} of {len(is_good):,} rows have {unwanted} numbers, the first is "
+                f"row {bad[0]:,} (from 0)"
+            )
+
+
+def check_bounded(name: str, tree: object) -> None:
+    """Raise ValueError, naming the leaf and the number, if a float is not finite or too large."""
+    check_finite(name, tree)
+    for leaf, values in _float_rows(name, tree):
+        is_large = np.abs(values) > LARGEST_NUMBER
+        if is_large.any():
+            row, column = np.argwhere(is_large)[0]
+            raise ValueError(
+                f"{leaf} must be within ±{LARGEST_NUMBER:g}; got {values[row, column]:g} in row {row:,} (from 0)"
+            )
+
+
+def _float_rows(name: str, tree: object) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield the name and the numbers [N, C] of each leaf of floats; a scalar is one row."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        values = np.atleast_1d(np.asarray(leaf))
+        if np.issubdtype(values.dtype, np.floating):
+            yield f"{name}{jax.tree_util.keystr(path)}", values.reshape(len(values), math.prod(values.shape[1:]))
+
+
+def check_count(name: str, value: object, most: int) -> None:
+    """Raise ValueError unless a value is one integer in 0..most."""
+    number = np.asarray(value)
+    if number.shape or number.dtype.kind not in "iu" or not 0 <= int(number) <= most:
+        raise ValueError(f"{name} must be a whole number in 0..{most}; got {shortened(repr(value))}")
+
+
+def check_like(name: str, tree: object, wanted: object) -> None:
+    """Raise ValueError, naming the leaf, unless two pytrees of the same structure have equal shapes and dtypes."""
+    pairs: Iterable[Any] = zip(jax.tree_util.tree_leaves_with_path(tree), jax.tree.leaves(wanted), strict=True)
+    for (path, leaf), like in pairs:
+        label = f"{name}{jax.tree_util.keystr(path)}"
+        check_shape(label, leaf, tuple(like.shape))
+        if dtype_of(leaf) != like.dtype:
+            raise ValueError(f"{label} must be {like.dtype}; got {dtype_of(leaf)}")

@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from a2tg_jax.core.checks import (
     FLOATS,
+    LARGEST_NUMBER,
     check_array,
     check_floats,
     check_int,
@@ -30,6 +31,7 @@ from a2tg_jax.core.numerics import safe_divide, safe_sqrt
 from a2tg_jax.core.pytree import pytree
 from a2tg_jax.core.sh import NUM_BASES
 
+LARGEST_LOG_SCALE = math.log(LARGEST_NUMBER)
 INITIAL_OPACITY = 0.1
 MOST_ROUNDING = 0.1
 """Largest step of means in float32 without a warning, in units of the median scale."""

@@ -4,7 +4,7 @@ import dataclasses
 import inspect
 from typing import Any, Self
 
-from a2tg_jax.host.text import counted, did_you_mean
+from a2tg_jax.base.text import counted, did_you_mean
 
 
 class FieldError(TypeError, ValueError):

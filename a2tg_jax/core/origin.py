@@ -10,10 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from a2tg_jax.base.text import shortened
 from a2tg_jax.core.camera_paths import vertical_of
-from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.cameras import MAX_SKEW, Camera, check_calibration
+from a2tg_jax.core.checks import check_bounded, check_floats, check_shape
 from a2tg_jax.core.named_fields import NamedFields
-from a2tg_jax.core.similarity import Similarity
+from a2tg_jax.core.similarity import Similarity, check_similarity
 
 Color = tuple[float, float, float]
 BLACK: Color = (0.0, 0.0, 0.0)
@@ -110,3 +112,18 @@ class Origin(NamedFields):
 
     def __repr__(self) -> str:
         return f"Origin({len(self.names)} cameras, {int(np.sum(self.is_test))} of them for testing)"
+
+
+def check_origin(origin: Origin) -> None:
+    """Raise ValueError, naming the field, unless the cameras and the transform of an origin are valid."""
+    cameras = zip(origin.names, origin.viewmats, origin.Ks, origin.sizes.tolist(), strict=True)
+    for name, viewmat, K, (width, height) in cameras:
+        check_calibration(viewmat, K, width, height, f"origin, camera {shortened(name)}")
+    check_similarity(origin.transform, "origin.transform")
+    if origin.up is not None:
+        check_shape("origin.up", origin.up, (3,))
+        if not abs(np.linalg.norm(origin.up) - 1) < MAX_SKEW:
+            raise ValueError(f"origin.up must have unit length; got {np.asarray(origin.up).tolist()}")
+    for name, rows in origin.corrections.items():
+        check_floats(f"origin.corrections.{name}", rows, (len(origin.names), *np.shape(rows)[1:]))
+        check_bounded(f"origin.corrections.{name}", rows)

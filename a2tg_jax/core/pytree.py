@@ -73,8 +73,8 @@ def is_shared(node: object) -> bool:
     return isinstance(node, Shared)
 
 
-def beside(*, default: object) -> Any:
-    """Return a field outside the pytree: results of transformations have its default instead."""
+def beside(*, default: object = dataclasses.MISSING) -> Any:
+    """Return a field outside the pytree: results of transformations have its default instead, or None without one."""
     return dataclasses.field(default=default, metadata={"beside": True})
 
 
@@ -114,7 +114,10 @@ def pytree(cls: Any = None, /, **options: Any) -> Any:
     # For errors, which name a leaf by its path, such as params.gaussians.means.
     keys = tuple(jax.tree_util.GetAttrKey(name) for name in dynamic)
     common = {field.name for field in dataclasses.fields(made) if field.metadata.get("shared")}
-    left_out = {field.name: field.default for field in dataclasses.fields(made) if field.name in kinds["beside"]}
+    left_out: dict[str, object] = {}
+    for field in dataclasses.fields(made):
+        if field.name in kinds["beside"]:
+            left_out[field.name] = None if field.default is dataclasses.MISSING else field.default
 
     def flatten(node: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         values = node.__dict__
@@ -194,11 +197,6 @@ def check_pytree(name: str, value: object) -> None:
         # `__dict__`, not getattr: an undecorated subclass inherits the mark of its base.
         if is_other and kind.__dict__.get(MARK) is not kind:
             raise ValueError(f"{name} must be a pytree: decorate the class {kind.__name__} with @a2tg_jax.pytree")
-
-
-def num_compiled(jitted: Any) -> int:
-    """Return the number of compiled programs of a function of `jax.jit` in this process."""
-    return int(jitted._cache_size())  # JAX has no public counterpart
 
 
 # Training differentiates and changes the floats of a pytree. `partition` separates them from the rest, integers such as

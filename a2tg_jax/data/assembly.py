@@ -7,23 +7,30 @@ import dataclasses
 import itertools
 import warnings
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from a2tg_jax.base.text import counted, first_names, in_bytes
 from a2tg_jax.core.camera_paths import LEAST_FACING, distance_to_subject, nearest_point, outlying_cameras
-from a2tg_jax.core.cameras import LARGEST_COORDINATE, MAX_SKEW, Camera, check_calibration, pinhole_pixels
-from a2tg_jax.core.geometry import NEAR_PLANE
+from a2tg_jax.core.cameras import LARGEST_COORDINATE, MAX_SKEW, Camera, check_calibration
 from a2tg_jax.core.numerics import evenly_chosen
+from a2tg_jax.core.pictures import DepthMap, Mask, Picture
+from a2tg_jax.core.sight import FIRST_LOOK, Sight, unseeing
 from a2tg_jax.core.similarity import Similarity, camera_centers
 from a2tg_jax.data.photo_points import MOST_PLAIN, MOST_VIEWS, Look, agreeing_points, plain_share
-from a2tg_jax.data.photo_store import DepthMap, Mask, Picture
-from a2tg_jax.data.scene import Scene, View
-from a2tg_jax.host.text import counted, first_names
+from a2tg_jax.scene import Scene, View, ray_bytes, rays_of_lenses
 
+MANY_LENSES = 8
+"""Number of lenses beyond which it is likely that each photograph was calibrated alone."""
+GENERIC_NAMES = {
+    "0", "capture", "colmap", "data", "dataset", "dense", "images", "input", "output", "photos", "scene", "sfm",
+    "sparse", "undistorted",
+}  # fmt: skip
+"""Names of folders, in lower case, that do not distinguish scenes."""
 NUM_POINTS = 10_000
 """Number of points made for a scene without any. Views that see none of these get further ones."""
 NUM_CANDIDATES = 100_000
@@ -37,8 +44,6 @@ DEEPEST_AROUND = 2.0
 SHALLOWEST = 0.5
 DEEPEST = 10.0
 """Depths of random points in front of other cameras."""
-FIRST_LOOK = 10_000
-"""Number of evenly chosen points that a view is tested with first."""
 GREY = 128 / 255
 """Colour of points whose colour is unknown."""
 FARTHEST = 1e5
@@ -239,53 +244,6 @@ def _start_without_points(
             points = np.concatenate([points, more])
             colors = np.concatenate([colors, np.full(more.shape, GREY)])
     return _MadePoints(points, np.rint(255 * colors).astype(np.uint8), obstacle)
-
-
-class Sight(NamedTuple):
-    """The part of the world that a view shows."""
-
-    viewmat: np.ndarray
-    """[4, 4] world to camera."""
-    K: np.ndarray
-    """[3, 3]."""
-    low: np.ndarray
-    """[2] smallest x and y in the image plane of K."""
-    high: np.ndarray
-    """[2] largest ones."""
-
-    @staticmethod
-    def of(viewmat: np.ndarray, K: np.ndarray, size: tuple[int, int], rays: ArrayLike | None) -> "Sight":
-        """Return what a view of (height, width) shows, with `rays` as in `Camera.rays`."""
-        if rays is None:
-            height, width = size
-            return Sight(viewmat, K, np.zeros(2), np.array([width, height], np.float64))
-        # NaN: pixels without a ray.
-        return Sight(viewmat, K, np.nanmin(rays, axis=(0, 1)), np.nanmax(rays, axis=(0, 1)))
-
-    @staticmethod
-    def of_camera(camera: Camera) -> "Sight":
-        """Return what a camera shows."""
-        viewmat = np.asarray(camera.viewmat, np.float64)
-        return Sight.of(viewmat, np.asarray(camera.K, np.float64), (camera.height, camera.width), camera.rays)
-
-    def depths_seen(self, points: np.ndarray, near_plane: float = NEAR_PLANE) -> np.ndarray:
-        """Return the depths [S] of the points, among [P, 3], that are in the picture and beyond the near plane."""
-        in_frame = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
-        in_front = in_frame[in_frame[:, 2] > near_plane]
-        places = pinhole_pixels(in_front, self.K)
-        is_seen = ((places >= self.low) & (places <= self.high)).all(axis=1)
-        return np.asarray(in_front[is_seen, 2])
-
-    def num_seen(self, points: np.ndarray, near_plane: float = NEAR_PLANE) -> int:
-        """Return the number of points [P, 3] in the picture and beyond the near plane."""
-        return len(self.depths_seen(points, near_plane))
-
-
-def unseeing(points: np.ndarray, sights: Sequence[Sight]) -> list[int]:
-    """Return the indices of the views that see none of the points [P, 3]."""
-    # Most views see one of a few points, which saves testing them all.
-    some = points[:: max(1, len(points) // FIRST_LOOK)]
-    return [number for number, sight in enumerate(sights) if not (sight.num_seen(some) or sight.num_seen(points))]
 
 
 def random_points(sights: Sequence[Sight], object_axes: np.ndarray | None = None) -> np.ndarray:
@@ -514,3 +472,23 @@ def split_views(views: Sequence[Held], every: int) -> tuple[list[Held], list[Hel
         number = numbers.setdefault((view.panorama, index if view.panorama is None else 0), len(numbers))
         (held_out if every and number % every == 0 else kept).append(view)
     return kept, held_out
+
+
+def warn_of_lenses(scene: Scene) -> None:
+    """Warn if most photographs have their own lens: the rays of each then take more memory than its pixels."""
+    views = [view for view in (*scene.train, *scene.test) if view.camera.rays is not None]
+    num = len(rays_of_lenses(views))
+    if num > MANY_LENSES and 2 * num > len(views):
+        warnings.warn(
+            f"{scene.name}: {len(views)} photographs have {num} lenses, whose rays take {in_bytes(ray_bytes(views))}: "
+            'calibrate photographs of one camera together, or undistort them (lens="undistort")',
+            stacklevel=3,
+        )
+
+
+def scene_name(folder: Path) -> str:
+    """Return the end of a folder's path, from the last name that says more than "scene" or "colmap" does."""
+    # The first part is the root, which is no name.
+    parts = folder.resolve().parts
+    specific = [at for at, part in enumerate(parts) if at and part.lower() not in GENERIC_NAMES]
+    return "/".join(parts[specific[-1] if specific else -1 :])

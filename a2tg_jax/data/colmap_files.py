@@ -27,9 +27,9 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
+from a2tg_jax.base.regular_files import open_regular
+from a2tg_jax.base.text import shortened
 from a2tg_jax.data.colmap_cameras import BY_NAME, MODELS, CameraModel, ColmapCamera
-from a2tg_jax.host.regular_files import open_regular
-from a2tg_jax.host.text import shortened
 
 KINDS = ("cameras", "images", "points3D", "rigs", "frames")
 """Names of a model's files without suffix. A model has cameras and images, and the others if it needs them."""

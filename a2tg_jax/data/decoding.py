@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
-from a2tg_jax.host.regular_files import open_regular
-from a2tg_jax.host.text import shortened
+from a2tg_jax.base.regular_files import open_regular
+from a2tg_jax.base.text import shortened
 
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "AVIF", "BMP", "GIF", "PPM")
 HEIC_BRANDS = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx"}

@@ -14,8 +14,8 @@ import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from a2tg_jax.base.regular_files import sha256_of
 from a2tg_jax.host.progress_bars import new_bar, progress_over
-from a2tg_jax.host.regular_files import sha256_of
 
 CHUNK_BYTES = 1 << 20
 TIMEOUT_SECONDS = 60

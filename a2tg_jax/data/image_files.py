@@ -8,8 +8,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePath, PureWindowsPath
 from typing import TypeVar
 
-from a2tg_jax.host.regular_files import is_regular, names_in
-from a2tg_jax.host.text import counted, shortened
+from a2tg_jax.base.regular_files import is_regular, names_in
+from a2tg_jax.base.text import counted, shortened
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".avif")
 """Suffixes of photographs, in lower or upper case."""

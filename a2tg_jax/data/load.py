@@ -7,8 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
+from a2tg_jax.base.regular_files import expanded, is_regular
 from a2tg_jax.core.checks import check_literal
-from a2tg_jax.data.assembly import check_test_every, with_validation_views
+from a2tg_jax.data.assembly import check_test_every, scene_name, warn_of_lenses, with_validation_views
 from a2tg_jax.data.colmap import find_models, load_colmap
 from a2tg_jax.data.lenses import LensUse, forget_rays
 from a2tg_jax.data.phone_captures import polycam, record3d
@@ -16,7 +17,6 @@ from a2tg_jax.data.photo_folder import capture_hint, holds_photos, is_video
 from a2tg_jax.data.photo_reading import AlphaMeaning, MaskMeaning, Options
 from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.photogrammetry import metashape, realityscan
-from a2tg_jax.data.scene import Scene, scene_name, warn_of_lenses
 from a2tg_jax.data.synthetic import BUILT_IN
 from a2tg_jax.data.transforms import (
     BLENDER_FILES,
@@ -28,8 +28,8 @@ from a2tg_jax.data.transforms import (
     load_transforms,
     transforms_in,
 )
-from a2tg_jax.host.regular_files import expanded, is_regular
-from a2tg_jax.host.text import as_argument
+from a2tg_jax.host.command_words import as_argument
+from a2tg_jax.scene import Scene
 
 HeldOut = Literal["test", "validation"]
 OTHER_PROGRAMS: tuple[Callable[[Path], list[Cameras]], ...] = (polycam, record3d, metashape, realityscan)

@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 from typing import NamedTuple
 
-from a2tg_jax.host.regular_files import is_regular, read_regular
+from a2tg_jax.base.regular_files import is_regular, read_regular
 
 MODELS = (
     ("3DGS", "point_cloud/iteration_*/point_cloud.ply"), ("3DGS", "iteration_*/point_cloud.ply"),

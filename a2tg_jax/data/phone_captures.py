@@ -13,13 +13,13 @@ import numpy as np
 from scipy.ndimage import binary_dilation, label
 from scipy.spatial.transform import Rotation
 
+from a2tg_jax.base.json_text import MOST_BYTES, number_of, read_object
+from a2tg_jax.base.regular_files import is_regular, read_regular
+from a2tg_jax.base.text import shortened
 from a2tg_jax.data.assembly import PointCloud
 from a2tg_jax.data.decoding import picture_size, read_grey, read_pixels
 from a2tg_jax.data.image_files import PHOTO_SUFFIXES, find_image, map_in_threads
 from a2tg_jax.data.transforms import Cameras, Frames, check_images
-from a2tg_jax.host.json_text import MOST_BYTES, number_of, read_object
-from a2tg_jax.host.regular_files import is_regular, read_regular
-from a2tg_jax.host.text import shortened
 
 POLYCAM_FOLDERS = (("corrected_cameras", "corrected_images"), ("cameras", "corrected_images"), ("cameras", "images"))
 """Folders of cameras and images of the keyframes; those after Polycam's optimisation come first."""

@@ -16,14 +16,14 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from a2tg_jax.base.json_text import MOST_BYTES
+from a2tg_jax.base.regular_files import is_regular, names_in, open_regular, read_regular
+from a2tg_jax.base.text import shortened
 from a2tg_jax.data.assembly import rigid_motion
 from a2tg_jax.data.decoding import picture_size
 from a2tg_jax.data.image_files import PHOTO_SUFFIXES, find_image, warn_of_unposed
 from a2tg_jax.data.ply import read_ply_points
 from a2tg_jax.data.transforms import Cameras, Frames, check_images
-from a2tg_jax.host.json_text import MOST_BYTES
-from a2tg_jax.host.regular_files import is_regular, names_in, open_regular, read_regular
-from a2tg_jax.host.text import shortened
 
 Element = ElementTree.Element
 LARGEST_SKEW = 0.5

@@ -10,10 +10,10 @@ from typing import BinaryIO
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from a2tg_jax.base.regular_files import is_regular, open_regular
+from a2tg_jax.base.text import shortened
 from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.data.assembly import PointCloud
-from a2tg_jax.host.regular_files import is_regular, open_regular
-from a2tg_jax.host.text import shortened
 
 OLD_TYPES = ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")
 NEW_TYPES = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64")

@@ -14,6 +14,9 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from PIL import Image
 
+from a2tg_jax.base.machine import num_threads
+from a2tg_jax.base.regular_files import expanded
+from a2tg_jax.base.text import counted, first_names
 from a2tg_jax.core.camera_paths import upright_rotation, vertical_of
 from a2tg_jax.core.checks import check_literal
 from a2tg_jax.data.colmap_cameras import ColmapCamera
@@ -25,10 +28,7 @@ from a2tg_jax.data.photo_folder import LEAST_PHOTOS
 from a2tg_jax.data.photo_reading import HALF, MASKS
 from a2tg_jax.data.staging import Panorama, Staged, directions, stage
 from a2tg_jax.data.video import DEFAULT_FRAMES
-from a2tg_jax.host.machine import num_threads
 from a2tg_jax.host.progress_bars import clock, counting, ticking
-from a2tg_jax.host.regular_files import expanded
-from a2tg_jax.host.text import counted, first_names
 
 Matching = Literal["auto", "exhaustive", "sequential"]
 """Pairs of photographs to match: all of them (exhaustive), neighbours by name (sequential), or by their number."""

@@ -18,6 +18,7 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from a2tg_jax.base.text import counted
 from a2tg_jax.data.decoding import PictureFacts, picture_facts, read_pixels, save_upright
 from a2tg_jax.data.image_files import map_in_threads, on_disk
 from a2tg_jax.data.lenses import sampled
@@ -25,7 +26,6 @@ from a2tg_jax.data.panoramas import Projection, projection_of
 from a2tg_jax.data.photo_folder import LEAST_PHOTOS, find_photos, is_video
 from a2tg_jax.data.photo_reading import HALF, MASKS, mask_names, read_mask, warn_of_grey, warn_of_lacking_masks
 from a2tg_jax.data.video import extract_frames
-from a2tg_jax.host.text import counted
 
 Panorama = Literal["auto", "yes", "no"]
 """Whether pictures twice as wide as high are panoramas: those that are recognised (auto), all of them, or none."""

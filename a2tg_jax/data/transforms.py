@@ -18,18 +18,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from a2tg_jax.base.json_text import number_of, read_json
+from a2tg_jax.base.regular_files import is_regular, names_in
+from a2tg_jax.base.text import first_names, shortened
 from a2tg_jax.core.cameras import LONGEST_SIDE
-from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, every_kth, rigid_motion
+from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, every_kth, rigid_motion, scene_name
 from a2tg_jax.data.colmap import points_in_world_of
 from a2tg_jax.data.colmap_cameras import ColmapCamera
 from a2tg_jax.data.image_files import inside
 from a2tg_jax.data.lenses import Lens, LensUse, checked_lens
 from a2tg_jax.data.photo_reading import Counted, Options, Photo, read_photos
 from a2tg_jax.data.ply import read_ply_points
-from a2tg_jax.data.scene import Scene, scene_name
-from a2tg_jax.host.json_text import number_of, read_json
-from a2tg_jax.host.regular_files import is_regular, names_in
-from a2tg_jax.host.text import first_names, shortened
+from a2tg_jax.scene import Scene
 
 NERFSTUDIO_FILE = "transforms.json"
 BLENDER_FILES = ("transforms_train.json", "transforms_test.json")

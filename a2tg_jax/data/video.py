@@ -14,11 +14,11 @@ import numpy as np
 from PIL import Image
 from scipy.ndimage import laplace
 
+from a2tg_jax.base.regular_files import open_regular
 from a2tg_jax.data.decoding import MAX_PIXELS
+from a2tg_jax.host.command_words import as_argument
 from a2tg_jax.host.optional import optional
 from a2tg_jax.host.progress_bars import counting
-from a2tg_jax.host.regular_files import open_regular
-from a2tg_jax.host.text import as_argument
 
 DEFAULT_FRAMES = 150
 SHARPNESS_WIDTH = 640

@@ -28,6 +28,7 @@ from a2tg_jax.events import (
     clear_moments,
     gather_moments,
     gather_rows,
+    multiples,
 )
 from a2tg_jax.model import Model
 
@@ -57,7 +58,7 @@ class CloneSplitPrune(StepEvent):
 
     Examples:
       >>> a2tg.CloneSplitPrune(cap=5000, threshold=2e-4).times(30_000)
-      Times(first=501, last=14999, every=100)
+      range(600, 15000, 100)
     """
 
     cap: int = static(default=500_000)
@@ -88,7 +89,7 @@ class CloneSplitPrune(StepEvent):
 
     def times(self, num_iterations: int) -> Times:
         # In 3DGS's program after 500 and before 15,000 of 30,000 iterations, every 100.
-        return Times(num_iterations // 60 + 1, num_iterations // 2 - 1, max(10, round(num_iterations / 300)))
+        return multiples(max(10, round(num_iterations / 300)), num_iterations // 60 + 1, num_iterations // 2 - 1)
 
     def num_rows(self, num: int, num_iterations: int) -> int:
         return max(num, self.cap)
@@ -128,7 +129,7 @@ class FillingDensity(CloneSplitPrune):
     If pruning would leave too few Gaussians, the most opaque stay."""
 
     def num_rows(self, num: int, num_iterations: int) -> int:
-        count = self.times(num_iterations).num_times
+        count = len(self.times(num_iterations))
         if num * 2.0**count < self.cap:
             raise ValueError(
                 f"cap has room for {self.cap:,} Gaussians, but {num:,} Gaussians at most double in each of the "
@@ -137,10 +138,10 @@ class FillingDensity(CloneSplitPrune):
         return max(num, self.cap)
 
     def plan(self, now: Now, model: Model, gradients: Array) -> tuple[CloneSplitPlan, Array]:
-        assert now.times is not None
+        assert now.num_left is not None
         is_there = _is_live(model)
         num_live = jnp.sum(is_there, dtype=jnp.int32)
-        reached = number_to_reach(num_live, self.cap, now.times.num_left(now.iteration))
+        reached = number_to_reach(num_live, self.cap, now.num_left)
         # An event doubles a Gaussian once at most.
         reached = jnp.minimum(reached, 2 * num_live)
         is_kept = is_there & ~self._is_pruned(now, model)
@@ -223,7 +224,7 @@ class OpacityReset(StepEvent):
 
     def times(self, num_iterations: int) -> Times:
         every = int(reset_interval(num_iterations))
-        return Times(every, num_iterations // 2 - 1, every)
+        return multiples(every, every, num_iterations // 2 - 1)
 
     def apply(self, now: Now, model: Model, moments: AdamState, state: tuple[()]) -> Change:
         gaussians, appearance = model.appearance.limit_opacities(model.gaussians, jnp.asarray(self.most))

@@ -25,12 +25,12 @@ from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.origin import Color
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.table import is_table, map_rows
-from a2tg_jax.data.scene import View, counted_pixels, view_image
-from a2tg_jax.events import Change, Due, HostEvent, clear_moments, iterations_at
+from a2tg_jax.events import Change, Due, HostEvent, Times, clear_moments, times_at
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderOutput
 from a2tg_jax.render import jitted_render
-from a2tg_jax.renderer import room_for
+from a2tg_jax.renderer import plan_render
+from a2tg_jax.scene import View, counted_pixels, view_image
 
 # Chosen in experiments/NOTEBOOK.md, "New Gaussians where pictures are wrong".
 MOST_VIEWS = 48
@@ -49,7 +49,7 @@ class PlaceByError(HostEvent):
     where that is random), with the cameras of the scene, not refined ones, and without exposures.
 
     Examples:
-      >>> a2tg.PlaceByError(share=0.1, at=(0.25, 0.5)).iterations(1000)
+      >>> a2tg.PlaceByError(share=0.1, at=(0.25, 0.5)).times(1000)
       (250, 500)
     """
 
@@ -63,10 +63,10 @@ class PlaceByError(HostEvent):
     def check_options(self) -> None:
         check_number("share", self.share, least=0, most=1)
         check_number("cap", self.cap, least=2)
-        self.iterations(1)  # checks `at`
+        self.times(1)  # checks `at`
 
-    def iterations(self, num_iterations: int) -> tuple[int, ...]:
-        return iterations_at(self.at, num_iterations)
+    def times(self, num_iterations: int) -> Times:
+        return times_at(self.at, num_iterations)
 
     def num_programs(self, num_iterations: int) -> int:
         return 2  # Rows keep their number; tile lists grow with the Gaussians.
@@ -117,7 +117,7 @@ def gaussians_at_errors(
         raise ValueError("views must hold at least one view; got none")
     views = evenly_chosen(views, MOST_VIEWS)
     dtype = model.gaussians.means.dtype
-    settings = room_for(model, [view.camera for view in views])
+    settings = plan_render(model, [view.camera for view in views])
     behind = jnp.asarray(background, dtype)
     totals = []
     drawn = []

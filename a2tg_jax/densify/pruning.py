@@ -16,17 +16,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from a2tg_jax.base.text import counted
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_number
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree, static
-from a2tg_jax.data.scene import View, counted_pixels, views_by_kind
-from a2tg_jax.events import LEAST_LEFT, Change, Due, HostEvent, Times, iterations_at, keep_rows
-from a2tg_jax.host.text import counted
+from a2tg_jax.events import LEAST_LEFT, Change, Due, HostEvent, Times, keep_rows, times_at
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.views import render_traced
-from a2tg_jax.renderer import room_for
+from a2tg_jax.renderer import plan_render
+from a2tg_jax.scene import View, counted_pixels, views_by_kind
 
 
 class _Pruning(HostEvent):
@@ -34,8 +34,8 @@ class _Pruning(HostEvent):
 
     at: tuple[float, ...]
 
-    def iterations(self, num_iterations: int) -> tuple[int, ...]:
-        return iterations_at(self.at, num_iterations, with_end=True)
+    def times(self, num_iterations: int) -> Times:
+        return times_at(self.at, num_iterations, with_end=True)
 
     def num_programs(self, num_iterations: int) -> int:
         return 2  # Rows keep their number; tile lists grow with the Gaussians.
@@ -50,7 +50,7 @@ class Prune(_Pruning):
     It uses the cameras of the scene, not refined ones.
 
     Examples:
-      >>> a2tg.Prune(share=0.1, at=(0.25, 0.5)).iterations(1000)
+      >>> a2tg.Prune(share=0.1, at=(0.25, 0.5)).times(1000)
       (250, 500)
     """
 
@@ -66,7 +66,7 @@ class Prune(_Pruning):
         check_number("share", self.share, least=0, below=1)
         if self.keep is not None:
             check_number("keep", self.keep, least=LEAST_LEFT)
-        self.iterations(1)  # checks `at`
+        self.times(1)  # checks `at`
 
     def num_after(self, num: int, num_iterations: int) -> int:
         return num if self.keep is None else min(num, self.keep)
@@ -89,7 +89,8 @@ class Prune(_Pruning):
 
 def during_growth(at: tuple[float, ...], num_iterations: int, growth: Times) -> tuple[float, ...]:
     """Return the fractions of a stage before its last growth, so that others replace what is pruned."""
-    return tuple(fraction for fraction in at if round(fraction * num_iterations) < growth.last_time)
+    last = growth[-1] if growth else 0
+    return tuple(fraction for fraction in at if round(fraction * num_iterations) < last)
 
 
 class Contributions(NamedTuple):
@@ -113,7 +114,7 @@ def shown_in(model: Model, views: Sequence[View], least: float = 1.0) -> Contrib
     if not len(total):
         return Contributions(total, num_views)
     dtype = model.gaussians.means.dtype
-    settings = room_for(model, [view.camera for view in views])
+    settings = plan_render(model, [view.camera for view in views])
     for alike in views_by_kind(views):
         rays = alike[0].camera.rays
         rays = None if rays is None else jnp.asarray(rays, dtype)
@@ -187,7 +188,7 @@ class PruneFloaters(_Pruning):
         check_number("least", self.least, least=0)
         if not self.at:
             raise ValueError("at must hold at least one fraction of the stage; got none")
-        self.iterations(1)  # checks `at`
+        self.times(1)  # checks `at`
 
     def apply(self, due: Due, model: Model, moments: AdamState, state: object) -> Change:
         num = model.num

@@ -21,7 +21,7 @@ from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.sh import NUM_BASES, directions_from, sh_basis
 from a2tg_jax.core.table import Shape, bucket_capacity, resize
-from a2tg_jax.events import Change, Due, HostEvent, Seen, iterations_at
+from a2tg_jax.events import Change, Due, HostEvent, Seen, Times, times_at
 from a2tg_jax.model import Model
 
 
@@ -78,10 +78,10 @@ class AdaptDegrees(HostEvent):
         check_number("budget_mb", self.budget_mb, least=0)
         check_number("highest", self.highest, least=0, most=MAX_DEGREE)
         check_number("idle", self.idle, least=0)
-        self.iterations(1)  # checks `at`
+        self.times(1)  # checks `at`
 
-    def iterations(self, num_iterations: int) -> tuple[int, ...]:
-        return iterations_at(self.at, num_iterations)
+    def times(self, num_iterations: int) -> Times:
+        return times_at(self.at, num_iterations)
 
     def num_programs(self, num_iterations: int) -> int:
         return 0  # `with_room` has made room, unless degrees may take more than half of the budget.
@@ -100,7 +100,7 @@ class AdaptDegrees(HostEvent):
         budget = bytes_of(self.budget_mb)
         left = budget - model.num_bytes + BYTES_PER_FLOAT * table.count_floats(model.num)
         # Each time raises a degree by one.
-        highest = min(self.highest, base + len(self.iterations(num_iterations)))
+        highest = min(self.highest, base + len(self.times(num_iterations)))
         room = most_blocks(left, base, highest, model.num, table)
         if BYTES_PER_FLOAT * len(table.padding) * room.num_elements > MOST_ROOM * budget:
             return model, moments

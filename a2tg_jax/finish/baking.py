@@ -35,11 +35,10 @@ from a2tg_jax.core.origin import Color
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity, camera_centers
 from a2tg_jax.data.assembly import scene_scale
-from a2tg_jax.data.scene import Scene, View
 from a2tg_jax.finish.shrinking import fewest_texels, texel_weights
-from a2tg_jax.io.other_programs import plain_gaussians
-from a2tg_jax.model import Model
+from a2tg_jax.model import Model, plain_gaussians
 from a2tg_jax.renderer import Renderer
+from a2tg_jax.scene import Scene, View
 from a2tg_jax.systems.baselines import Gaussians2d
 from a2tg_jax.texture import NEUTRAL_TEXEL
 from a2tg_jax.training import fit_stage

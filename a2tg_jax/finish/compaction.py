@@ -18,13 +18,13 @@ from numpy.typing import ArrayLike
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.origin import Color
-from a2tg_jax.data.scene import View, check_are_views, view_image
 from a2tg_jax.host.progress_bars import progress_over
 from a2tg_jax.io.columns import Precision
 from a2tg_jax.io.compact import CompactChoices, decode_model, encode_model
 from a2tg_jax.model import Model, check_is_model
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.renderer import Renderer
+from a2tg_jax.scene import View, check_are_views, view_image
 
 Loss = Callable[[Model], float]
 Ladder = Mapping[str, tuple[Precision, ...]]
@@ -150,8 +150,7 @@ def _drawing(
     if not cameras:
         raise ValueError("there are no views to measure a loss on")
     options: dict[str, Any] = {"background": background, "settings": settings, "has_geometry": False}
-    # With twice the given model's capacity, programs usually compile once.
-    capacities = {size: 2 * num for size, num in Renderer(model, cameras=cameras, **options).capacities.items()}
+    capacities = Renderer(model, cameras=cameras, **options).capacities
 
     def draw(other: Model) -> Iterator[np.ndarray]:
         renderer = Renderer(other, capacities=capacities, **options)

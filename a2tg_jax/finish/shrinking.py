@@ -24,13 +24,13 @@ from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import SH_C0, Gaussians
 from a2tg_jax.core.origin import Color
 from a2tg_jax.core.table import Group
-from a2tg_jax.data.scene import View, check_are_views
 from a2tg_jax.finish.compaction import loss_on_views
 from a2tg_jax.model import Model, check_is_model
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.render import background_array
 from a2tg_jax.renderer import plan_render
+from a2tg_jax.scene import View, check_are_views
 from a2tg_jax.texture import BYTES_PER_TEXEL, NEUTRAL_TEXEL, Textures
 
 LEAST_OPACITY = 1e-4

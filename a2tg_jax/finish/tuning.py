@@ -24,7 +24,6 @@ from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.numerics import normalize
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import combine, partition, pytree
-from a2tg_jax.data.scene import Scene
 from a2tg_jax.events import Change, Now, StepEvent
 from a2tg_jax.finish.compaction import (
     LADDER,
@@ -41,6 +40,7 @@ from a2tg_jax.io.columns import LEAST_OPACITY
 from a2tg_jax.io.compact import CompactChoices, Grids, encode_model, grids_of, half_turned
 from a2tg_jax.io.model_rows import check_encodable
 from a2tg_jax.model import Model
+from a2tg_jax.scene import Scene
 from a2tg_jax.training import DivergedError, Stage, System, fit_stage
 from a2tg_jax.training.corrections import Correction
 

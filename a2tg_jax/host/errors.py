@@ -6,8 +6,8 @@ import os
 import shutil
 from pathlib import Path
 
-from a2tg_jax.host.atomic import NO_ROOM
-from a2tg_jax.host.text import shortened
+from a2tg_jax.base.atomic import NO_ROOM
+from a2tg_jax.base.text import shortened
 
 PLENTY = 1 << 30
 """Free bytes above which a disk that accepts no file is likely to lack inodes."""

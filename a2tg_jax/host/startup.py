@@ -5,8 +5,8 @@ from pathlib import Path
 
 from jaxlib.version import __version__ as jaxlib_version
 
-from a2tg_jax.host import machine
-from a2tg_jax.host.machine import processor_features, processor_key
+from a2tg_jax.base import machine
+from a2tg_jax.base.machine import cache_folder, processor_features, processor_key
 
 CHECKED_JAX_VERSIONS = ((0, 10), (0, 11), (0, 12))
 """Versions that have the first two flags below; an unknown flag would end the process."""
@@ -35,7 +35,7 @@ def configure_cpu(*, use_cache: bool = True, num_threads: int | None = None) -> 
     Raises:
       ValueError: if the number of threads, here or in the environment, is not a positive integer.
     """
-    import jax  # Only here, as in `host.machine`.
+    import jax  # Only here, as in `base.machine`.
 
     if num_threads is not None:
         machine.set_num_threads(num_threads)
@@ -83,11 +83,6 @@ def add_xla_flags(flags: tuple[str, ...]) -> None:
     names = {flag.partition("=")[0] for flag in kept}
     kept += [flag for flag in flags if flag.partition("=")[0] not in names]
     os.environ["XLA_FLAGS"] = " ".join(kept)
-
-
-def cache_folder() -> Path:
-    """Return the cache folder: $XDG_CACHE_HOME/a2tg-jax, or ~/.cache/a2tg-jax."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "a2tg-jax"
 
 
 def compilation_cache_folder() -> Path:

@@ -19,7 +19,7 @@ import numpy as np
 import zstandard
 from PIL import Image
 
-from a2tg_jax.io.validate import numbers_of
+from a2tg_jax.base.json_text import numbers_of
 
 Precision = int | Literal["float32", "float16"]
 Choice = Literal["smallest", "lzma", "zstd", "webp", "deflate", "none"]

@@ -17,12 +17,14 @@ import numpy as np
 
 from a2tg_jax.appearance import Appearance
 from a2tg_jax.appearance.parts import MAX_DEGREE, log_exponents_of, shapes_of
+from a2tg_jax.base.atomic import write_whole
+from a2tg_jax.base.json_text import parse_json
+from a2tg_jax.base.regular_files import existing_bytes, expanded, reading, room_of
+from a2tg_jax.base.suffixes import check_suffix
 from a2tg_jax.core.checks import check_int, check_literal
+from a2tg_jax.core.config_json import config_from_dict, config_to_dict
 from a2tg_jax.core.gaussians import check_gaussians
 from a2tg_jax.core.named_fields import NamedFields
-from a2tg_jax.host.atomic import write_whole
-from a2tg_jax.host.json_text import parse_json
-from a2tg_jax.host.regular_files import expanded, room_of
 from a2tg_jax.io.columns import (
     MOST_BITS,
     AxisSteps,
@@ -37,8 +39,9 @@ from a2tg_jax.io.columns import (
     opacities_of,
     with_w,
 )
-from a2tg_jax.io.config_json import config_from_dict, config_to_dict
-from a2tg_jax.io.model_file import (
+from a2tg_jax.io.model_rows import Rows, check_encodable, joined_rows, model_of, ordered, rows_of_model
+from a2tg_jax.model import Model, check_is_model
+from a2tg_jax.model_file import (
     appearance_from_dict,
     appearance_to_dict,
     background_of,
@@ -47,9 +50,6 @@ from a2tg_jax.io.model_file import (
     origin_of,
     origin_shapes,
 )
-from a2tg_jax.io.model_rows import Rows, check_encodable, joined_rows, model_of, ordered, rows_of_model
-from a2tg_jax.io.validate import check_suffix, existing_bytes, reading
-from a2tg_jax.model import Model, check_is_model
 from a2tg_jax.texture import MAX_SIDE
 
 # As in PNG: CR LF shows a transfer as text, 0x1A ends a listing on Windows.

@@ -5,14 +5,13 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+from a2tg_jax.base.regular_files import expanded, is_regular
+from a2tg_jax.base.text import did_you_mean, shortened
 from a2tg_jax.core.origin import BLACK
 from a2tg_jax.data.other_runs import HOW_TO_EXPORT, model_hint
-from a2tg_jax.host.regular_files import expanded, is_regular
-from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.io.compact import load_compact, save_compact
 from a2tg_jax.io.gltf import load_gltf, save_gltf
 from a2tg_jax.io.gltf_container import buffer_files
-from a2tg_jax.io.model_file import load_model, save_model
 from a2tg_jax.io.other_programs import World, cut_numbers, reader_of, writer_as
 from a2tg_jax.io.ply import encode_packed_ply, load_ply_model, save_ply
 from a2tg_jax.io.sog import HEADER, STREAMED_HEADER, encode_sog, load_sog, sog_files
@@ -21,6 +20,7 @@ from a2tg_jax.io.spz import decode_spz, encode_spz
 from a2tg_jax.io.torch_checkpoint import save_checkpoint_gaussians
 from a2tg_jax.io.usd import import_usd, load_usd, save_usd
 from a2tg_jax.model import Model
+from a2tg_jax.model_file import load_model, save_model
 
 LEARNED = {
     "exposure": "learned exposures",

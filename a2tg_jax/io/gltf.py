@@ -15,15 +15,16 @@ import numpy as np
 from a2tg_jax.appearance import Appearance, TextureOptions, appearance_for
 from a2tg_jax.appearance.base import PARTS
 from a2tg_jax.appearance.parts import MAX_DEGREE, log_exponents_of, shapes_of
+from a2tg_jax.base.json_text import numbers_of
+from a2tg_jax.base.regular_files import expanded, reading
+from a2tg_jax.base.suffixes import check_suffix
+from a2tg_jax.base.text import shortened
 from a2tg_jax.core.checks import check_int, check_literal
+from a2tg_jax.core.config_json import config_from_dict
 from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.core.sh import NUM_BASES
-from a2tg_jax.host.regular_files import expanded
-from a2tg_jax.host.text import shortened
 from a2tg_jax.io.columns import Ends, dequantised, ends_of, quantised
-from a2tg_jax.io.config_json import config_from_dict
 from a2tg_jax.io.gltf_container import Builder, Document, mesh_nodes, scene_of_one
-from a2tg_jax.io.model_file import appearance_from_dict, appearance_to_dict, background_of, origin_of
 from a2tg_jax.io.model_rows import Rows, check_encodable, model_of, rows_of_model
 from a2tg_jax.io.other_programs import (
     Ellipsoids,
@@ -39,8 +40,8 @@ from a2tg_jax.io.other_programs import (
     upright,
 )
 from a2tg_jax.io.spz import GLTF_AXES, decode_spz
-from a2tg_jax.io.validate import check_suffix, live_model, numbers_of, reading
-from a2tg_jax.model import Model
+from a2tg_jax.model import Model, checked_live
+from a2tg_jax.model_file import appearance_from_dict, appearance_to_dict, background_of, origin_of
 from a2tg_jax.texture import MAX_SIDE
 
 SPLATS = "KHR_gaussian_splatting"
@@ -108,7 +109,8 @@ def save_gltf(
       200
     """
     check_literal("texels", texels, TexelKind)
-    model = live_model(path, model, "save_gltf")
+    check_suffix(path, "save_gltf")
+    model = checked_live(model)
     # glTF has no accessors of count 0.
     if not model.num:
         raise ValueError("model has no Gaussians; a glTF file has at least one")

@@ -17,13 +17,19 @@ from typing import Any
 
 import numpy as np
 
+from a2tg_jax.base.atomic import replacing, write_whole
+from a2tg_jax.base.json_text import numbers_of, parse_json
+from a2tg_jax.base.regular_files import (
+    LARGEST_RATIO,
+    MOST_ARRAY_BYTES,
+    existing_bytes,
+    is_regular,
+    read_regular,
+    room_of,
+)
+from a2tg_jax.base.text import PROGRAM, shortened
 from a2tg_jax.core.checks import check_int
 from a2tg_jax.data.ply import turn_of
-from a2tg_jax.host.atomic import replacing, write_whole
-from a2tg_jax.host.json_text import parse_json
-from a2tg_jax.host.regular_files import LARGEST_RATIO, MOST_ARRAY_BYTES, is_regular, read_regular, room_of
-from a2tg_jax.host.text import PROGRAM, shortened
-from a2tg_jax.io.validate import existing_bytes, numbers_of
 
 MAGIC = b"glTF"
 VERSION = 2

@@ -16,8 +16,7 @@ from a2tg_jax.appearance.files import arrays_of, with_arrays
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import Color, Origin
 from a2tg_jax.core.sh import NUM_BASES
-from a2tg_jax.io.validate import check_model
-from a2tg_jax.model import Model
+from a2tg_jax.model import Model, check_model
 
 HALF_TURNS = np.array(
     [

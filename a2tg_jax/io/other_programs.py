@@ -20,20 +20,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from a2tg_jax.appearance.base import check_appearance
-from a2tg_jax.appearance.parts import MAX_DEGREE, nearest_gaussians
+from a2tg_jax.appearance.parts import LEAST_OPACITY, MAX_DEGREE
+from a2tg_jax.base.atomic import write_whole
+from a2tg_jax.base.regular_files import existing_bytes, reading
+from a2tg_jax.base.text import counted, first_names, shortened
 from a2tg_jax.core.camera_paths import upright_rotation
 from a2tg_jax.core.checks import LARGEST_NUMBER, check_literal
-from a2tg_jax.core.gaussians import LARGEST_OPACITY, SH_C0, Gaussians, check_gaussians, logit
-from a2tg_jax.core.origin import Origin
+from a2tg_jax.core.gaussians import LARGEST_LOG_SCALE, LARGEST_OPACITY, SH_C0, Gaussians
+from a2tg_jax.core.origin import Origin, check_origin
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity, check_similarity, transform_gaussians
-from a2tg_jax.host.atomic import write_whole
-from a2tg_jax.host.text import counted, first_names, shortened
 from a2tg_jax.io.columns import logits_of, morton, opacities_of
-from a2tg_jax.io.model_file import origin_arrays, origin_header
-from a2tg_jax.io.validate import LARGEST_LOG_SCALE, check_model, check_origin, existing_bytes, reading
-from a2tg_jax.model import Model, concatenate
+from a2tg_jax.model import Model, check_model, concatenate, plain_gaussians
+from a2tg_jax.model_file import origin_arrays, origin_header
 
 Up = Literal["y", "z"]
 World = Literal["upright", "original"]
@@ -50,7 +49,6 @@ UNMOVED = Similarity(1.0, np.eye(3), np.zeros(3))
 LEVEL = math.cos(math.radians(3))
 """Cosine of the largest angle between the estimated vertical and an axis that counts as the vertical itself."""
 LEAST_SCALE = 1e-30
-LEAST_OPACITY = 1e-6
 FILTER = "filter_3D"
 """Name of the widths of Mip-Splatting's filter in PLY files."""
 LEAST_LENGTH = 1e-9
@@ -104,30 +102,6 @@ class WorldGaussians(NamedTuple):
     """[N, 3] float64 positions, without the offset."""
     turn: np.ndarray
     """[3, 3] rotation from the original world."""
-
-
-def plain_gaussians(gaussians: Gaussians | Model, *, keeps_shapes: bool = False) -> Gaussians:
-    """Return the Gaussians of a model without its appearance, in the model's world.
-
-    They have their own opacities, and all spherical harmonics of the model.
-
-    Args:
-      gaussians: as in `save_ply`.
-      keeps_shapes: the file also keeps kernel shapes. If not, each kernel becomes the nearest Gaussian.
-    """
-    if isinstance(gaussians, Model):
-        model = gaussians.live
-        check_appearance(model.appearance, model.gaussians)
-        shown = model.appearance
-        gaussians = dataclasses.replace(model.gaussians, sh=jnp.asarray(model.sh))
-        if shown.shapes is not None and not keeps_shapes:
-            gaussians = nearest_gaussians(gaussians, np.asarray(shown.shapes))
-        if not shown.has_own_opacities:
-            # Logits must be finite.
-            opacities = jnp.clip(shown.opacities(model.gaussians), LEAST_OPACITY, LARGEST_OPACITY)
-            gaussians = dataclasses.replace(gaussians, logit_opacities=logit(opacities))
-    check_gaussians(gaussians)
-    return gaussians
 
 
 def world_gaussians(

@@ -5,10 +5,10 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from a2tg_jax.base.json_text import numbers_of
+from a2tg_jax.base.text import shortened
 from a2tg_jax.core.cameras import Camera, check_calibration, check_camera
-from a2tg_jax.host.text import shortened
 from a2tg_jax.io.saved_file import load_saved
-from a2tg_jax.io.validate import numbers_of
 
 # A file may come from a stranger: sides decide how much memory a frame takes.
 LARGEST_SIDE = 16384

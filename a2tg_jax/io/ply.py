@@ -24,17 +24,18 @@ import numpy as np
 from numpy.typing import DTypeLike
 from scipy.spatial.transform import Rotation
 
+from a2tg_jax.appearance.parts import LEAST_OPACITY
+from a2tg_jax.base.atomic import write_whole
+from a2tg_jax.base.regular_files import check_exists, expanded, open_regular, reading
+from a2tg_jax.base.suffixes import check_suffix
 from a2tg_jax.core.gaussians import SH_C0, Gaussians, rotation_matrices
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.data.other_runs import model_hint
 from a2tg_jax.data.ply import OFFSET, RGB, ROTATION, SH_DEGREE0, PlyFile, largest_color
-from a2tg_jax.host.atomic import write_whole
-from a2tg_jax.host.regular_files import expanded, open_regular
 from a2tg_jax.io.columns import logits_of
 from a2tg_jax.io.other_programs import (
     FILTER,
-    LEAST_OPACITY,
     FileRows,
     PlacedSplats,
     World,
@@ -53,8 +54,7 @@ from a2tg_jax.io.other_programs import (
     without_largest,
     world_gaussians,
 )
-from a2tg_jax.io.validate import check_exists, check_model, check_suffix, reading
-from a2tg_jax.model import Model
+from a2tg_jax.model import Model, check_model
 
 MEANS = ("x", "y", "z")
 NORMALS = ("nx", "ny", "nz")

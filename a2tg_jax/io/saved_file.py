@@ -4,9 +4,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from a2tg_jax.host.json_text import read_json
-from a2tg_jax.host.regular_files import expanded
-from a2tg_jax.io.validate import check_exists
+from a2tg_jax.base.json_text import read_json
+from a2tg_jax.base.regular_files import check_exists, expanded
 
 T = TypeVar("T")
 VERSION = 1

@@ -23,13 +23,13 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 from scipy import sparse
 
+from a2tg_jax.base.json_text import numbers_of, parse_json
+from a2tg_jax.base.regular_files import existing_bytes, read_regular, reading, room_of
+from a2tg_jax.base.text import PROGRAM, shortened
 from a2tg_jax.core.checks import check_int
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.data.decoding import MOST_BYTES
 from a2tg_jax.data.ply import OFFSET, ROTATION, turn_of
-from a2tg_jax.host.json_text import parse_json
-from a2tg_jax.host.regular_files import read_regular, room_of
-from a2tg_jax.host.text import PROGRAM, shortened
 from a2tg_jax.io.columns import LONGEST_WEBP_SIDE, opacities_of
 from a2tg_jax.io.gltf_container import LONGEST_NAME
 from a2tg_jax.io.other_programs import (
@@ -41,7 +41,6 @@ from a2tg_jax.io.other_programs import (
     without_largest,
 )
 from a2tg_jax.io.ply import place_marks
-from a2tg_jax.io.validate import existing_bytes, numbers_of, reading
 from a2tg_jax.model import Model
 
 HEADER = "meta.json"

@@ -24,10 +24,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from a2tg_jax.base.regular_files import room_of
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity, transform_gaussians
-from a2tg_jax.host.regular_files import room_of
 from a2tg_jax.io.columns import unzstd
 from a2tg_jax.io.other_programs import (
     Ellipsoids,

@@ -17,15 +17,15 @@ from typing import Any
 
 import numpy as np
 
+from a2tg_jax.base.atomic import replacing
+from a2tg_jax.base.json_text import parse_json
+from a2tg_jax.base.npz import read_npz
+from a2tg_jax.base.regular_files import MOST_ARRAY_BYTES, check_exists, expanded, open_regular, reading
+from a2tg_jax.base.suffixes import check_suffix
+from a2tg_jax.base.text import shortened
 from a2tg_jax.core.origin import BLACK
 from a2tg_jax.core.sh import NUM_BASES
-from a2tg_jax.host.atomic import replacing
-from a2tg_jax.host.json_text import parse_json
-from a2tg_jax.host.npz import read_npz
-from a2tg_jax.host.regular_files import MOST_ARRAY_BYTES, expanded, open_regular
-from a2tg_jax.host.text import shortened
 from a2tg_jax.io import usd_fields
-from a2tg_jax.io.model_file import background_of, origin_of
 from a2tg_jax.io.other_programs import (
     Ellipsoids,
     degree_to_read,
@@ -36,8 +36,8 @@ from a2tg_jax.io.other_programs import (
     splats_of,
     upright,
 )
-from a2tg_jax.io.validate import check_exists, check_suffix, live_model, reading
-from a2tg_jax.model import Model
+from a2tg_jax.model import Model, checked_live
+from a2tg_jax.model_file import background_of, origin_of
 
 ORIGIN = "a2tg:origin"
 """Name of the origin, as JSON, in the custom data of a particle field."""
@@ -57,7 +57,8 @@ def save_usd(path: str | os.PathLike[str], model: Model, *, ellipsoids: bool = F
     Raises:
       ValueError: if usd-core is missing, or the model has a number that is not finite or too large.
     """
-    stage = _stage_of(live_model(path, model, "save_usd"), ellipsoids)
+    check_suffix(path, "save_usd")
+    stage = _stage_of(checked_live(model), ellipsoids)
     path = expanded(path)
     # usd-core chooses the format by the suffix, which the temporary path lacks.
     with replacing(path) as temporary, tempfile.TemporaryDirectory(dir=path.parent) as folder:

@@ -19,18 +19,18 @@ from a2tg_jax.core.cameras import Camera, moved_viewmat
 from a2tg_jax.core.checks import check_mask, check_shape
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.optim import adam_init, adam_update
-from a2tg_jax.data.scene import View, check_are_views, view_image
 from a2tg_jax.model import Model, check_is_model
 from a2tg_jax.rasterize.render_types import RenderSettings
+from a2tg_jax.rasterize.room import TileRoom
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import plan_render
+from a2tg_jax.scene import View, check_are_views, view_image
 from a2tg_jax.training.losses import SSIM_WINDOW, photometric_loss
 
 NUM_STEPS = 100
 FIRST_RATE = 2e-3
 LAST_RATE = 2e-5
 """Learning rates in radians and units of the normalised world, falling exponentially: 2.5° over all steps."""
-HEAD_ROOM = 1.5  # Moved cameras list other splats than planned.
 
 
 def color_fit(image: ArrayLike, target: ArrayLike, mask: ArrayLike | None = None) -> np.ndarray:
@@ -94,7 +94,8 @@ def align_poses(
     check_is_model(model)
     model = model.live
     background = jnp.asarray(model.background if background is None else background, model.gaussians.means.dtype)
-    planned = plan_render(model, [view.camera for view in views], head_room=HEAD_ROOM, settings=settings)
+    settings = plan_render(model, [view.camera for view in views], settings=settings)
+    room = TileRoom({"views": settings.capacity or 0})
     descend = jax.jit(_descent, static_argnums=(6, 7))
     aligned = []
     for view in views:
@@ -102,12 +103,10 @@ def align_poses(
         mask = None if view.mask is None else jnp.asarray(view.mask.read())[..., None]
         camera = jax.tree.map(lambda x: jnp.asarray(x, background.dtype), view.camera)
         inputs = (model.gaussians, model.appearance, camera, target, mask, background)
-        settings = planned
         twist, is_full = descend(*inputs, settings, num_steps)
         # A full tile list drops splats, which makes the loss wrong: the descent is repeated.
         while is_full:
-            assert settings.capacity is not None
-            settings = dataclasses.replace(settings, capacity=2 * settings.capacity)
+            settings = dataclasses.replace(settings, capacity=room.enlarge("views"))
             twist, is_full = descend(*inputs, settings, num_steps)
         viewmat = moved_viewmat(twist, camera.viewmat).astype(jnp.float32)
         aligned.append(dataclasses.replace(view, camera=dataclasses.replace(view.camera, viewmat=viewmat)))

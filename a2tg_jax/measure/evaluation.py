@@ -10,18 +10,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from a2tg_jax.base.text import counted
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.origin import Color
-from a2tg_jax.data.scene import View, check_are_views, view_image
-from a2tg_jax.host.text import counted
 from a2tg_jax.measure.alignment import color_fit
 from a2tg_jax.measure.metrics import load_lpips, lpips, psnr, ssim
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.render import appearance_of
 from a2tg_jax.renderer import Renderer
+from a2tg_jax.scene import View, check_are_views, view_image
 from a2tg_jax.texture import Textures
 from a2tg_jax.training.corrections import exposed
 from a2tg_jax.training.reports import flat_psnr, has_learned

@@ -8,9 +8,10 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated
 
+from a2tg_jax.base.atomic import write_whole
+from a2tg_jax.base.text import in_bytes, shortened
 from a2tg_jax.core.budget import budget_in_bytes
 from a2tg_jax.core.numerics import evenly_chosen
-from a2tg_jax.data.scene import Scene
 from a2tg_jax.finish.compaction import (
     ASSUMED_PSNR,
     LADDER,
@@ -35,8 +36,7 @@ from a2tg_jax.finish.tuning import (
     smallest_tuned,
     tune_compact,
 )
-from a2tg_jax.host.atomic import write_whole
-from a2tg_jax.host.text import defaulting_to, in_bytes, shortened
+from a2tg_jax.host.command_words import defaulting_to
 from a2tg_jax.io.compact import GROUPS, CompactChoices, encode_model
 from a2tg_jax.io.formats import FORMATS
 from a2tg_jax.io.model_rows import check_encodable
@@ -47,6 +47,7 @@ from a2tg_jax.results.model_source import open_source
 from a2tg_jax.results.output_paths import check_export, check_output
 from a2tg_jax.results.report import aligned, loss_text
 from a2tg_jax.results.run_evaluation import refined_views
+from a2tg_jax.scene import Scene
 from a2tg_jax.training import System
 
 SUFFIX = ".a2tgz"

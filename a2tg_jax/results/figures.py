@@ -16,11 +16,11 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from a2tg_jax.base.atomic import replacing
+from a2tg_jax.base.text import PROGRAM
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.data.colmap import read_cameras_and_points
-from a2tg_jax.host.atomic import replacing
-from a2tg_jax.host.text import PROGRAM
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
 from a2tg_jax.renderer import Renderer

@@ -30,10 +30,10 @@ import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from a2tg_jax.base.atomic import left_over, named_if_full, write_whole
+from a2tg_jax.base.operating_system import flush_folder, try_lock
+from a2tg_jax.base.regular_files import is_regular, read_regular
 from a2tg_jax.data.other_runs import model_hint
-from a2tg_jax.host.atomic import left_over, named_if_full, write_whole
-from a2tg_jax.host.operating_system import flush_folder, try_lock
-from a2tg_jax.host.regular_files import is_regular, read_regular
 
 # If the newest is damaged, training continues from the one before.
 KEPT_CHECKPOINTS = 2
@@ -49,14 +49,57 @@ IN_USE = "is not empty; add `resume` to continue it, `overwrite` to start again,
 """Error text of training for a folder that already holds a run."""
 
 
-class RunFolder:
+class StageFiles:
+    """Models, states and checkpoints of stages in a folder."""
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    def own(self, path: Path) -> Path:
+        """Return the path of a file that is about to be written."""
+        return path
+
+    def model(self, name: str) -> Path:
+        return self.path / "models" / f"{name}.npz"
+
+    def state(self, name: str) -> Path:
+        return self.path / "states" / f"{name}.npz"
+
+    def checkpoint(self, name: str, iteration: int) -> Path:
+        return self.path / "checkpoints" / f"{name}-{iteration:010d}.npz"
+
+    def checkpoints(self, name: str, ending: str = "") -> list[Path]:
+        """Return the checkpoints of a stage, oldest first."""
+        # Iterations have ten digits, so that names sort by number.
+        return sorted((self.path / "checkpoints").glob(f"{glob.escape(name)}-{'[0-9]' * 10}.npz{ending}"))
+
+    def drop_old_checkpoints(self, name: str) -> None:
+        """Delete all checkpoints of a stage but the newest `KEPT_CHECKPOINTS`."""
+        for path in self.checkpoints(name)[:-KEPT_CHECKPOINTS]:
+            path.unlink()
+
+    def drop_all_checkpoints(self, name: str) -> None:
+        """Delete all checkpoints of a stage, damaged ones as well."""
+        for path in [*self.checkpoints(name), *self.checkpoints(name, DAMAGED)]:
+            path.unlink()
+
+    def keep_state(self, name: str, iteration: int) -> None:
+        """Keep the checkpoint of a stage's last iteration, if it is there, as its state at the end."""
+        checkpoint = self.checkpoint(name, iteration)
+        if checkpoint.is_file():
+            state = self.own(self.state(name))
+            state.parent.mkdir(exist_ok=True)
+            checkpoint.replace(state)
+
+
+class RunFolder(StageFiles):
     """Paths within one run folder, and its marker: the list of files that runs wrote there.
 
     Only listed files are ever replaced or deleted.
     """
 
     def __init__(self, path: Path):
-        self.path = path
+        super().__init__(path)
         self.marker = path / ".a2tg-run"
         self.record = path / "run.toml"
         self.tensorboard = path / "tensorboard"
@@ -69,9 +112,6 @@ class RunFolder:
         self.figures = path / "figures"
         self.test = path / "test"
 
-    def model(self, name: str) -> Path:
-        return self.path / "models" / f"{name}.npz"
-
     def baked(self, name: str) -> Path:
         """Plain splats of a model, kept for further files."""
         return self.path / "baked" / f"{name}.npz"
@@ -79,17 +119,16 @@ class RunFolder:
     def corrections(self, name: str) -> Path:
         return self.path / "corrections" / f"{name}.json"
 
+    def diverged(self, name: str, iteration: int) -> Path:
+        return self.path / "diverged" / f"{name}-{iteration:010d}.npz"
+
     def history(self, name: str) -> Path:
         return self.path / "history" / f"{name}.csv"
 
-    def state(self, name: str) -> Path:
-        return self.path / "states" / f"{name}.npz"
-
-    def checkpoint(self, name: str, iteration: int) -> Path:
-        return self.path / "checkpoints" / f"{name}-{iteration:010d}.npz"
-
-    def diverged(self, name: str, iteration: int) -> Path:
-        return self.path / "diverged" / f"{name}-{iteration:010d}.npz"
+    def drop_all_checkpoints(self, name: str) -> None:
+        """Delete all checkpoints of a stage, and their folder if it is empty then."""
+        super().drop_all_checkpoints(name)
+        remove_if_empty(self.path / "checkpoints", self.path)
 
     # The marker
 
@@ -167,33 +206,6 @@ class RunFolder:
     def has_progress(self) -> bool:
         """Whether there is a checkpoint, a model or the state before a divergence."""
         return any(path.parent.name in ("checkpoints", "models", "diverged") for path in self.files())
-
-    # Checkpoints
-
-    def checkpoints(self, name: str, ending: str = "") -> list[Path]:
-        """Return the checkpoints of a stage, oldest first."""
-        # Iterations have ten digits, so that names sort by number.
-        return sorted((self.path / "checkpoints").glob(f"{glob.escape(name)}-{'[0-9]' * 10}.npz{ending}"))
-
-    def drop_old_checkpoints(self, name: str) -> None:
-        """Delete all checkpoints of a stage but the newest `KEPT_CHECKPOINTS`."""
-        for path in self.checkpoints(name)[:-KEPT_CHECKPOINTS]:
-            path.unlink()
-
-    def drop_all_checkpoints(self, name: str) -> None:
-        """Delete all checkpoints of a stage, damaged ones as well."""
-        for path in [*self.checkpoints(name), *self.checkpoints(name, DAMAGED)]:
-            path.unlink()
-        with contextlib.suppress(OSError):  # Other stages' checkpoints may be in it.
-            (self.path / "checkpoints").rmdir()
-
-    def keep_state(self, name: str, iteration: int) -> None:
-        """Keep the checkpoint of a stage's last iteration, if it is there, as its state at the end."""
-        checkpoint = self.checkpoint(name, iteration)
-        if checkpoint.is_file():
-            state = self.own(self.state(name))
-            state.parent.mkdir(exist_ok=True)
-            checkpoint.replace(state)
 
 
 def iteration_of(checkpoint: Path) -> int:

@@ -7,13 +7,13 @@ import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from a2tg_jax.base.machine import allowed_memory, default_platform
+from a2tg_jax.base.text import in_bytes
 from a2tg_jax.data.photo_store import SHARE_OF_MEMORY
-from a2tg_jax.data.scene import Scene, View
-from a2tg_jax.host.machine import allowed_memory, default_platform
-from a2tg_jax.host.text import in_bytes
 from a2tg_jax.results.commands import QUICK_SIDE, quick_flags
 from a2tg_jax.results.plan import RunPlan
 from a2tg_jax.results.record import MEMORY_OF_FILE, RunRecord
+from a2tg_jax.scene import Scene, View
 from a2tg_jax.training.cost import (
     COMPILER,
     FIRST_PROGRAM,

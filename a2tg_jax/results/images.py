@@ -18,9 +18,9 @@ from PIL import ExifTags, Image, ImageDraw, ImageFont
 from PIL.PngImagePlugin import PngInfo
 from scipy.ndimage import gaussian_filter, uniform_filter
 
+from a2tg_jax.base.atomic import replacing
+from a2tg_jax.base.text import PROGRAM
 from a2tg_jax.core.notebook_display import enlarged
-from a2tg_jax.host.atomic import replacing
-from a2tg_jax.host.text import PROGRAM
 
 ERROR_GAIN = 4
 CHECKER = (0.75, 0.55)

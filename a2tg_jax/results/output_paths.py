@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
-from a2tg_jax.host.atomic import file_to_write
+from a2tg_jax.base.atomic import file_to_write
 from a2tg_jax.results.folder import RunFolder
 
 EXPORTS = (".a2tgz", ".glb")

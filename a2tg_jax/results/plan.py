@@ -25,9 +25,14 @@ class PlannedStage:
     """First system that has the stage."""
     index: int
     """Index of the stage in its system, from 0."""
-    start: str | None
-    """Name of the stage whose model it starts from; None for a first stage."""
+    start: "PlannedStage | None"
+    """The stage whose model it starts from; None for a first stage."""
     stage: Stage = dataclasses.field(repr=False, compare=False)
+
+    @property
+    def first_iteration(self) -> int:
+        """Number of iterations in the stages before it."""
+        return 0 if self.start is None else self.start.first_iteration + self.start.stage.iterations
 
     @property
     def checkpoint_every(self) -> int:
@@ -59,7 +64,7 @@ class RunPlan:
         kept = {chain[-1] for chain in self.chains.values()}
         for planned in self.stages:
             if planned.stage.continues and planned.start is not None:
-                kept.add(planned.start)
+                kept.add(planned.start.name)
         return tuple(name for name in self.names if name in kept)
 
     def __getitem__(self, name: str) -> PlannedStage:
@@ -69,11 +74,6 @@ class RunPlan:
                 return planned
         raise ValueError(f"the run has the models {', '.join(self.names)}; got {name!r}")
 
-    def first_iteration(self, name: str) -> int:
-        """Return the number of iterations in the stages before a stage."""
-        start = self[name].start
-        return 0 if start is None else self.first_iteration(start) + self[start].stage.iterations
-
 
 def plan_run(systems: Mapping[str, System]) -> RunPlan:
     """Return the stages of systems by label, the main one first. Two systems share their stages up to the first that
@@ -82,8 +82,8 @@ def plan_run(systems: Mapping[str, System]) -> RunPlan:
     chains: dict[str, tuple[str, ...]] = {}
     for label, system in systems.items():
         chain: list[str] = []
+        start = None
         for index, stage in enumerate(system.all_stages()):
-            start = chain[-1] if chain else None
             planned = _equal_stage(stages, system, index, start, stage)
             if planned is None:
                 planned = PlannedStage(f"{label}-{stage.name}", _system_at(system, index), index, start, stage)
@@ -91,17 +91,19 @@ def plan_run(systems: Mapping[str, System]) -> RunPlan:
                     raise ValueError(f"two stages of the run are called {planned.name!r}")
                 stages.append(planned)
             chain.append(planned.name)
+            start = planned
         chains[label] = tuple(chain)
     return RunPlan(tuple(stages), chains)
 
 
 def _equal_stage(
-    stages: Sequence[PlannedStage], system: System, index: int, start: str | None, stage: Stage
+    stages: Sequence[PlannedStage], system: System, index: int, start: PlannedStage | None, stage: Stage
 ) -> PlannedStage | None:
     """Return the planned stage whose training would give the same model, bit for bit; None if there is none."""
     for planned in stages:
         is_alike = (
-            (planned.index, planned.start) == (index, start)
+            planned.index == index
+            and planned.start is start
             and common_options(planned.system) == common_options(system)
             and is_equal(planned.stage, stage)
         )
@@ -122,10 +124,18 @@ def common_options(system: System) -> list[Any]:
     return [getattr(system, name) for name in names if name not in STAGE_OPTIONS]
 
 
+def is_same_so_far(a: System, b: System, index: int) -> bool:
+    """Return whether two systems train their stages up to an index alike, whatever follows."""
+    if common_options(a) != common_options(b):
+        return False
+    pairs = zip(a.all_stages()[: index + 1], b.all_stages()[: index + 1], strict=True)
+    return all(is_equal(first, second) for first, second in pairs)
+
+
 def is_equal(a: Stage, b: Stage) -> bool:
     """Return whether two stages are equal in everything, arrays and classes included."""
     # jax.tree compares classes and static fields; arrays are leaves, which == does not reduce to one bool.
-    if jax.tree.structure(a) != jax.tree.structure(b):  # type: ignore[operator]
+    if a.name != b.name or jax.tree.structure(a) != jax.tree.structure(b):  # type: ignore[operator]
         return False
     pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
     return all(np.array_equal(np.asarray(x), np.asarray(y)) for x, y in pairs)

@@ -28,13 +28,13 @@ from typing import Annotated, Any, Literal
 import tomli_w
 from tyro.conf import Fixed, Suppress, UseAppendAction, arg
 
+from a2tg_jax.base.atomic import write_whole
+from a2tg_jax.base.json_text import MOST_TOML_BYTES, parse_toml
+from a2tg_jax.base.regular_files import expanded, is_regular, read_regular
+from a2tg_jax.base.text import did_you_mean, shortened
 from a2tg_jax.core.budget import MEGABYTE, budget_in_bytes, megabytes_of
+from a2tg_jax.core.config_json import changed_config, config_from_dict, config_to_dict, flatten_config, merged
 from a2tg_jax.data.load import SceneSource
-from a2tg_jax.host.atomic import write_whole
-from a2tg_jax.host.json_text import MOST_TOML_BYTES, parse_toml
-from a2tg_jax.host.regular_files import expanded, is_regular, read_regular
-from a2tg_jax.host.text import did_you_mean, shortened
-from a2tg_jax.io.config_json import changed_config, config_from_dict, config_to_dict, flatten_config, merged
 from a2tg_jax.io.model_rows import check_encodable
 from a2tg_jax.results.commands import repeating_command
 from a2tg_jax.results.folder import RunFolder

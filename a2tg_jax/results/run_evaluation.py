@@ -15,20 +15,18 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
+from a2tg_jax.base.atomic import write_whole
+from a2tg_jax.base.json_text import read_json
+from a2tg_jax.base.regular_files import sha256_of
 from a2tg_jax.data.assembly import every_kth
 from a2tg_jax.data.load import HeldOut, SceneSource
-from a2tg_jax.data.scene import Scene, View, view_image
-from a2tg_jax.host.atomic import write_whole
-from a2tg_jax.host.json_text import read_json
-from a2tg_jax.host.regular_files import sha256_of
-from a2tg_jax.host.text import counted
-from a2tg_jax.io.model_file import load_model
 from a2tg_jax.io.ply import save_ply
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.measure.alignment import align_poses
 from a2tg_jax.measure.evaluation import Evaluation, evaluate
 from a2tg_jax.measure.metrics import load_lpips
 from a2tg_jax.model import Model
+from a2tg_jax.model_file import load_model
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.commands import resuming_command
 from a2tg_jax.results.figures import write_figures
@@ -47,6 +45,8 @@ from a2tg_jax.results.model_source import settings_of
 from a2tg_jax.results.plan import RunPlan
 from a2tg_jax.results.record import read_record
 from a2tg_jax.results.report import Comparison, ModelResult, RunResult, metrics_json, per_view_json, write_report
+from a2tg_jax.results.stage_training import check_held_out
+from a2tg_jax.scene import Scene, View, view_image
 from a2tg_jax.training import System
 from a2tg_jax.training.corrections import learned
 from a2tg_jax.web.page import viewer_html_with
@@ -96,7 +96,7 @@ def evaluate_run(run: RunFolder, scene: Scene | None = None, *, lpips_weights: P
         data = encode_web_scene(main, title=f"{scene.name} · {result.main}")
         write_whole(run.own(run.viewer), viewer_html_with(data))
     camera = (*scene.test, *scene.train)[0].camera
-    starts = {name: plan.first_iteration(name) for name in models}
+    starts = {name: plan[name].first_iteration for name in models}
     figures = write_figures(run, main, camera, settings_of(plan[result.main].system), histories, starts)
     comparisons = _write_sheets(run, result, models, scene)
     write_report(run, result, comparisons, figures, is_split_by_number=is_split_by_number(record.scene, scene))
@@ -120,28 +120,17 @@ def check_weights(lpips_weights: Path | None) -> None:
         load_lpips(lpips_weights)
 
 
-def check_held_out(model: Model, scene: Scene, path: Path) -> None:
-    """Raise ValueError if a file's model was trained on views that its scene now holds out, which would flatter their
-    metrics. A model without an origin, whose views are unknown, passes."""
-    if model.origin is None:
-        return
-    trained = {name for name, is_test in zip(model.origin.names, model.origin.is_test, strict=True) if not is_test}
-    leaked = sorted(trained & {view.name for view in scene.test} - {view.name for view in scene.train})
-    if leaked:
-        raise ValueError(
-            f"{path} was trained on {counted(len(leaked), 'view')} that {scene.name} now holds out, such as "
-            f"{leaked[0]}: the photographs have changed, or views of panoramas, which are held out together since, are "
-            "among them; train in a new folder"
-        )
-
-
 def finished_stages(run: RunFolder, plan: RunPlan) -> list[str]:
     """Return the names of the stages with models. Raises FileNotFoundError if there are none, or the model from which a
     later stage was trained is missing."""
     names = [name for name in plan.names if run.model(name).is_file()]
     if not names:
         raise FileNotFoundError(f"{run.path} has no finished stage yet; continue with: {resuming_command(run)}")
-    needed = {plan.main[0], *(plan[name].start for name in names)}
+    needed = {plan.main[0]}
+    for name in names:
+        start = plan[name].start
+        if start is not None:
+            needed.add(start.name)
     for name in plan.names:
         if name in needed and name not in names:
             again = f"put it back, or train it again with: {resuming_command(run)}"

@@ -5,6 +5,7 @@ to the run folder.
 """
 
 import contextlib
+import dataclasses
 import hashlib
 import json
 import tempfile
@@ -17,11 +18,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from a2tg_jax.data.scene import Scene, views_by_kind
 from a2tg_jax.host import signals
-from a2tg_jax.io.model_file import load_model
+from a2tg_jax.model_file import load_model
 from a2tg_jax.parallel import any_process, broadcast, check_batch_size, leave
 from a2tg_jax.results.record import RunRecord
+from a2tg_jax.scene import Scene, views_by_kind
 from a2tg_jax.training import DivergedError, Session, fit_stage, load_checkpoint
 
 COMPARED = ("options", "`devices`", "views, cameras or points")
@@ -94,15 +95,20 @@ def follow_first_process(record: RunRecord, scene: Scene, session: Session) -> N
             if header["name"] is None:
                 return
             planned = plan[header["name"]]
-            resume = _received(Path(folder, "resume.npz"))
-            start = _received(Path(folder, "start.npz"))
+            resume_file = _received(Path(folder, "resume.npz"))
+            start_file = _received(Path(folder, "start.npz"))
+            resume = None
+            if resume_file is not None:
+                # The first process has checked its options.
+                checkpoint = load_checkpoint(resume_file, system=type(planned.system))
+                resume = dataclasses.replace(checkpoint, system=planned.system)
             with contextlib.suppress(DivergedError):  # The first process restores the stage or gives up.
                 fit_stage(
                     scene,
                     planned.system,
                     planned.index,
-                    None if start is None else load_model(start),
-                    resume=None if resume is None else load_checkpoint(resume, system=type(planned.system)),
+                    None if start_file is None else load_model(start_file),
+                    resume=resume,
                     on_checkpoint=lambda checkpoint: None,
                     checkpoint_every=planned.checkpoint_every,
                     progress=False,

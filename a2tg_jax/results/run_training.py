@@ -8,14 +8,12 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-from a2tg_jax.data.scene import Scene
+from a2tg_jax.base.machine import Devices
 from a2tg_jax.finish.tuning import ITERATIONS
 from a2tg_jax.host import signals
 from a2tg_jax.host.errors import error_text
-from a2tg_jax.host.machine import Devices
 from a2tg_jax.io.formats import load_splats
-from a2tg_jax.io.model_file import load_model, number_in_file, save_model
-from a2tg_jax.model import Model
+from a2tg_jax.model_file import number_in_file, save_model
 from a2tg_jax.results.commands import file_command, resuming_command
 from a2tg_jax.results.compression import SUFFIX, CompressOptions, compress
 from a2tg_jax.results.folder import RunFolder, check_free, claimed, iteration_of, put_back_old, set_aside
@@ -23,15 +21,15 @@ from a2tg_jax.results.forecast import doubts_about, print_forecast, room_for_pho
 from a2tg_jax.results.history import EventWriter, write_history
 from a2tg_jax.results.model_source import check_init, write_first_stage
 from a2tg_jax.results.output_paths import check_apart, check_output
-from a2tg_jax.results.plan import PlannedStage, RunPlan
+from a2tg_jax.results.plan import PlannedStage
 from a2tg_jax.results.record import OnNan, RunRecord, is_finished, read_record, write_record
 from a2tg_jax.results.report import RunResult
-from a2tg_jax.results.run_checkpoints import check_finished, last_state, newest_checkpoint
-from a2tg_jax.results.run_evaluation import check_held_out, check_weights, evaluate_run
+from a2tg_jax.results.run_evaluation import check_weights, evaluate_run
 from a2tg_jax.results.run_processes import check_alike, leave_others, send_stage
+from a2tg_jax.results.stage_training import check_finished, train_stage
+from a2tg_jax.scene import Scene
 from a2tg_jax.training import Checkpoint, DivergedError, Session, StageResult, fit_stage, save_checkpoint
 from a2tg_jax.training.loop import IsStopped, Watch, never, unwatched
-from a2tg_jax.training.recorded_views import check_names
 from a2tg_jax.training.registry import system_to_dict
 from a2tg_jax.training.start import check_loss_data, check_start
 
@@ -223,8 +221,8 @@ def train_run(
             check_finished(path, planned)
         else:
             events = EventWriter(run, name) if options.tensorboard else None
-            fit_this = functools.partial(fit, after=after[name])
-            result = _train_stage(run, plan, planned, scene, fit_this, events, record.on_nan)
+            fit_this = functools.partial(fit, after=after[name], checkpoint_every=planned.checkpoint_every)
+            result = _train_stage(run, planned, scene, fit_this, events, record.on_nan)
             if events is not None:
                 events.add(result.history)
                 events.close()
@@ -241,64 +239,28 @@ def train_run(
 
 def _train_stage(
     run: RunFolder,
-    plan: RunPlan,
     planned: PlannedStage,
     scene: Scene,
     fit: Callable[..., StageResult],
     events: EventWriter | None,
     on_nan: OnNan,
 ) -> StageResult:
-    """Train a stage from its newest checkpoint or its beginning; after a divergence, restore it if allowed."""
+    """Train a stage as `train_stage`; after a divergence, restore it if allowed."""
 
-    def keep(checkpoint: Checkpoint) -> None:
-        if checkpoint.iteration == 0:
-            return  # The stage's start gives the same state.
+    def skip(checkpoint: Checkpoint) -> None:
+        if events is not None:
+            events.skip(checkpoint.history)
+
+    def add(checkpoint: Checkpoint) -> None:
         if events is not None:
             events.add(checkpoint.history)
-        save_checkpoint(run.own(run.checkpoint(planned.name, checkpoint.iteration)), checkpoint)
-        run.drop_old_checkpoints(planned.name)
 
     num_restored = None
     while True:
-        model = None if planned.start is None else _model_to_start(run, planned.start, scene)
-        resume = newest_checkpoint(run, planned)
-        resume_file = None
-        if resume is not None:
-            resume_file = run.checkpoint(planned.name, resume.iteration)
-            if events is not None:
-                events.skip(resume.history)
-        elif planned.stage.continues and planned.start is not None:
-            resume = last_state(run, plan[planned.start], planned.name)
-            resume_file = None if resume is None else run.state(planned.start)
-        # Files, not arrays: other processes read them exactly as this one did.
-        model_file = None if planned.start is None else run.model(planned.start)
-        send_stage(planned.name, [resume_file, model_file], num_restored)
         try:
-            return fit(
-                planned.system,
-                planned.index,
-                model,
-                resume=resume,
-                on_checkpoint=keep,
-                checkpoint_every=planned.checkpoint_every,
-                title=planned.name,
-                num_restored=num_restored,
-            )
+            return train_stage(run, planned, scene, fit, num_restored=num_restored, on_resume=skip, on_checkpoint=add)
         except DivergedError as error:
             num_restored = _restored(run, planned.name, error, on_nan)
-
-
-def _model_to_start(run: RunFolder, start: str, scene: Scene) -> Model:
-    """Return the model of the stage before, after a check that the scene still has its training views."""
-    path = run.model(start)
-    model = load_model(path)
-    check_held_out(model, scene, path)
-    origin = model.origin
-    if origin is not None:
-        trained = [name for name, is_test in zip(origin.names, origin.is_test, strict=True) if not is_test]
-        advice = "restore the photographs, or train in a new folder"
-        check_names(trained, [view.name for view in scene.train], str(path), advice)
-    return model
 
 
 def _restored(run: RunFolder, name: str, error: DivergedError, on_nan: OnNan) -> int:

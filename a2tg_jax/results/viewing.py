@@ -20,11 +20,10 @@ import jax
 import numpy as np
 from PIL import Image
 
+from a2tg_jax.base.atomic import is_left_over, left_over, write_whole
+from a2tg_jax.base.json_text import read_json
+from a2tg_jax.base.text import counted, in_bytes
 from a2tg_jax.core.origin import BLACK, Color, Origin
-from a2tg_jax.data.scene import Scene, View, origin_of_scene, view_image
-from a2tg_jax.host.atomic import is_left_over, left_over, write_whole
-from a2tg_jax.host.json_text import read_json
-from a2tg_jax.host.text import counted, in_bytes
 from a2tg_jax.io.compact import decode_model
 from a2tg_jax.io.other_programs import matrix_of
 from a2tg_jax.io.web_scene import encode_web_scene
@@ -35,6 +34,7 @@ from a2tg_jax.results.images import to_uint8
 from a2tg_jax.results.model_source import Source
 from a2tg_jax.results.output_paths import check_new
 from a2tg_jax.results.report import loss_text
+from a2tg_jax.scene import Scene, View, origin_of_scene, view_image
 from a2tg_jax.training.loop import IsStopped, StageRun
 from a2tg_jax.training.stage import BACKGROUNDS
 from a2tg_jax.web.page import (

@@ -104,7 +104,7 @@ class A2tg(TwoStages):
     def _floats_in_budget(self) -> float:
         """Return the floats of kernel and texels that a Gaussian has on average in a full memory budget."""
         least = math.prod(self._start)
-        most = self.texture.cap**2 if self.texture.iterations(self.stage2_iterations) else least
+        most = self.texture.cap**2 if self.texture.times(self.stage2_iterations) else least
         if self.texture_share is None:
             # Up to half of the largest texture.
             return self._floats(min(BUDGET_TEXELS, (least + most) / 2))

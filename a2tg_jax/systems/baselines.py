@@ -52,7 +52,7 @@ class Gaussians2d(TwoStages):
     name: ClassVar[str] = "gaussians-2d"
 
     def stages(self) -> tuple[Stage, ...]:
-        pruning = pruned(self.prune, self.stage1_iterations, self.densify.times)
+        pruning = pruned(self.prune, self.stage1_iterations, self.densify.times(self.stage1_iterations))
         growth = grown_by_density(self.densify, self.budget_cap()), self.opacity_reset
         return self.continued(self.growing_stage((*growth, *pruning)))
 
@@ -85,7 +85,8 @@ class Gaussians2dMcmc(TwoStages):
 
     def stages(self) -> tuple[Stage, ...]:
         growth = grown_by_mcmc(self.densify, self.budget_cap())
-        return self.continued(self.growing_stage((*growth, *pruned(self.prune, self.stage1_iterations, densify_times))))
+        pruning = pruned(self.prune, self.stage1_iterations, densify_times(self.stage1_iterations))
+        return self.continued(self.growing_stage((*growth, *pruning)))
 
     @classmethod
     def presets(cls) -> dict[str, Self]:

@@ -6,6 +6,7 @@ from typing import Any, ClassVar, Self
 
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.appearance import Appearance, Bands, TexelRates, Texture, TextureOptions
+from a2tg_jax.base.text import shortened
 from a2tg_jax.core.budget import MEGABYTE, bytes_of, bytes_per_gaussian
 from a2tg_jax.core.checks import check_number
 from a2tg_jax.densify.placing import PlaceByError
@@ -13,7 +14,6 @@ from a2tg_jax.densify.pruning import Prune
 from a2tg_jax.densify.splitting import SplitByGradient
 from a2tg_jax.densify.view_dependence import AdaptDegrees
 from a2tg_jax.events import Event
-from a2tg_jax.host.text import shortened
 from a2tg_jax.mcmc import Noise, densify_times
 from a2tg_jax.systems.two_stages import PRUNING, LimitExponents, TwoStages, kernels_of, pruned
 from a2tg_jax.training.stage import Stage
@@ -80,7 +80,7 @@ class Bytewise(TwoStages):
         plain = Appearance(exponents=kernels.part, max_alpha=self.lookup.max_alpha)
         # Growth fills all bytes; the end of the first stage makes room for details.
         grow = dataclasses.replace(self.densify, cap=self._num_gaussians())
-        pruning = pruned(self.prune, self.stage1_iterations, densify_times)
+        pruning = pruned(self.prune, self.stage1_iterations, densify_times(self.stage1_iterations))
         placing = (dataclasses.replace(self.place, cap=grow.cap),) if self.place.share else ()
         last = (Prune(keep=self._num_kept()),) if self._share else ()
         growth = (Noise(), grow, *pruning, *placing, *last, *kernels.limits)
@@ -179,9 +179,9 @@ class Bytewise(TwoStages):
         times = {}
         for path, share in shares.items():
             if share:
-                times[path] = getattr(self, path).iterations(self.stage2_iterations)
-        for path, iterations in times.items():
-            if not iterations:
+                times[path] = getattr(self, path).times(self.stage2_iterations)
+        for path, of_event in times.items():
+            if not of_event:
                 raise ValueError(f"{path}.at must hold fractions at which its share of the bytes is spent; it is empty")
         if len(times) == 2 and times["view_dependence"][-1] > times["details"][0]:
             raise ValueError(

@@ -1,20 +1,19 @@
 """What the systems of this library share: a first stage that grows, a second one with a fixed number of Gaussians."""
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any, NamedTuple, Self
 
 import jax.numpy as jnp
 
 from a2tg_jax.appearance import Appearance, Exponents
 from a2tg_jax.appearance.parts import LARGEST_LOG_EXPONENT, MOST_SHARE
+from a2tg_jax.base.text import shortened
 from a2tg_jax.core.checks import check_number
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree
 from a2tg_jax.densify.clone_split import CloneSplitPrune, FillingDensity
 from a2tg_jax.densify.pruning import Prune, PruneFloaters, during_growth
 from a2tg_jax.events import Change, Event, Now, StepEvent, Times
-from a2tg_jax.host.text import shortened
 from a2tg_jax.mcmc import FillingMcmc, Mcmc, Noise
 from a2tg_jax.model import Model
 from a2tg_jax.training.options import System
@@ -67,16 +66,15 @@ class TwoStages(System):
         floaters = self.floaters
         length = self.stage1_iterations
         if floaters.min_views or floaters.near:
-            growing = [event for event in events if isinstance(event, StepEvent) and event.most_gaussians is not None]
-            growths = [event.times(length) for event in growing]
-            growths = [times for times in growths if times.num_times]
+            growths = [event.times(length) for event in events if event.most_gaussians is not None]
+            growths = [times for times in growths if times]
             if growths:
-                last = max(growths, key=lambda times: times.last_time)
-                floaters = dataclasses.replace(floaters, at=during_growth(floaters.at, length, last))
+                latest = max(growths, key=lambda times: times[-1])
+                floaters = dataclasses.replace(floaters, at=during_growth(floaters.at, length, latest))
                 if not floaters.at:
                     raise ValueError(
                         "floaters.at must hold a fraction before the last growth, which is at iteration "
-                        f"{last.last_time:,} of {length:,}, so that others replace what is pruned; got "
+                        f"{latest[-1]:,} of {length:,}, so that others replace what is pruned; got "
                         f"{shortened(self.floaters.at)}"
                     )
             events = (*events, floaters)
@@ -159,10 +157,10 @@ def grown_by_density(densify: CloneSplitPrune, budget_cap: int | None) -> CloneS
     return FillingDensity(**options | {"cap": budget_cap})
 
 
-def pruned(prune: Prune, num_iterations: int, growth: Callable[[int], Times]) -> tuple[Event, ...]:
+def pruned(prune: Prune, num_iterations: int, growth: Times) -> tuple[Event, ...]:
     """Return the event that prunes while others grow; none if its share is 0.
 
-    `growth` returns the times of growth in a stage by its length.
+    `growth` is the times of growth in a stage of that length.
 
     Raises:
       ValueError: if no fraction is left, though others grow.
@@ -174,11 +172,10 @@ def pruned(prune: Prune, num_iterations: int, growth: Callable[[int], Times]) ->
             f"prune.at must hold fractions up to {LAST_PRUNING}, after which too little replaces what is pruned; got "
             f"{shortened(prune.at)}: lower the last, or set prune.share to 0"
         )
-    times = growth(num_iterations)
-    at = during_growth(prune.at, num_iterations, times)
-    if not at and times.num_times:
+    at = during_growth(prune.at, num_iterations, growth)
+    if not at and growth:
         raise ValueError(
-            f"prune.at must hold a fraction before the last growth, which is at iteration {times.last_time:,} of "
+            f"prune.at must hold a fraction before the last growth, which is at iteration {growth[-1]:,} of "
             f"{num_iterations:,}; got {shortened(prune.at)}: lower the first, or set prune.share to 0"
         )
     return (dataclasses.replace(prune, at=at),) if at else ()

@@ -11,9 +11,9 @@ from jax import Array
 from jax.sharding import Mesh
 from numpy.typing import DTypeLike
 
-from a2tg_jax.data.scene import View, kinds_of, ray_bytes
-from a2tg_jax.host.machine import default_device, num_threads
+from a2tg_jax.base.machine import default_device, num_threads
 from a2tg_jax.parallel import any_process, everywhere, of_views, views_here
+from a2tg_jax.scene import View, kinds_of, ray_bytes
 
 HOST_SHARE = 2**30
 DEVICE_SHARE = 0.25
@@ -29,7 +29,7 @@ ALIGNMENT = 64
 
 
 Kind = tuple[int, int, int]
-"""Image size and lens of a view (`data.scene.kinds_of`)."""
+"""Image size and lens of a view (`scene.kinds_of`)."""
 
 
 class Photographs(NamedTuple):

@@ -9,12 +9,12 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
+from a2tg_jax.base.machine import Devices, allowed_memory, default_platform, num_threads
+from a2tg_jax.base.text import in_bytes
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.gaussians import floats_per_gaussian
-from a2tg_jax.data.scene import Scene, View, ray_bytes
 from a2tg_jax.events import HostEvent
-from a2tg_jax.host.machine import Devices, allowed_memory, default_platform, num_threads
-from a2tg_jax.host.text import in_bytes
+from a2tg_jax.scene import Scene, View, ray_bytes
 from a2tg_jax.training.batches import plan_batches, view_bytes
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Stage
@@ -144,7 +144,7 @@ def forecast_stages(
         on_host = [event for event in stage.events if isinstance(event, HostEvent)]
         programs = 1 + sum(event.num_programs(stage.iterations) for event in on_host)
         # An event has the old state and the new one; later, the devices get their shares.
-        is_changed = any(event.iterations(stage.iterations) for event in on_host)
+        is_changed = any(event.times(stage.iterations) for event in on_host)
         whole = STATES * (2 if is_changed else 1 + 1 / num_devices) * model_bytes
         seconds = stage.iterations * system.batch_size * (SECONDS_PER_ROW * num + SECONDS_PER_PIXEL * mean_pixels)
         needed = stage_bytes(scene, system, stage, num, model_bytes, num_devices)
@@ -196,7 +196,7 @@ def stage_bytes(
 
     Each of several devices has its share of the state, and, while it draws its views, a copy of the model.
     """
-    is_changed = any(isinstance(event, HostEvent) and event.iterations(stage.iterations) for event in stage.events)
+    is_changed = any(isinstance(event, HostEvent) and event.times(stage.iterations) for event in stage.events)
     largest = largest_view(scene.train)
     batch = system.batch_size // num_devices
     per_view = sum(BYTES_PER_FLOAT * correction.neutral.size for correction in stage.corrections)

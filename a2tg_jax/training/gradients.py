@@ -18,7 +18,8 @@ from a2tg_jax.events import read_probe
 from a2tg_jax.model import Model, check_is_model
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
-from a2tg_jax.rasterize.views import render_traced, with_capacity
+from a2tg_jax.rasterize.room import with_capacity
+from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.render import background_array
 from a2tg_jax.training.corrections import Correction, corrected_camera
 

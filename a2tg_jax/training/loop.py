@@ -9,23 +9,23 @@ import dataclasses
 import datetime
 import time
 import warnings
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from a2tg_jax.base.machine import Devices
+from a2tg_jax.core.compilations import compilations
 from a2tg_jax.core.numerics import evenly_chosen
-from a2tg_jax.core.pytree import num_compiled
 from a2tg_jax.core.table import Shape
-from a2tg_jax.data.scene import Scene
-from a2tg_jax.events import Change, Due, HostEvent, StepEvent
-from a2tg_jax.host.machine import Devices
+from a2tg_jax.events import Change, Due, Event, HostEvent, StepEvent
 from a2tg_jax.model import Model
 from a2tg_jax.parallel import any_process, check_batch_size, divided, everywhere, mesh_of, num_processes, whole
 from a2tg_jax.rasterize.render_types import RenderSettings
-from a2tg_jax.rasterize.views import capacity_for, pairs_of_view
+from a2tg_jax.rasterize.room import TileRoom, most_pairs
+from a2tg_jax.scene import Scene
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.checkpoint import COLUMNS, TERM, Checkpoint, History, Interrupted
 from a2tg_jax.training.corrections import check_corrections
@@ -59,7 +59,7 @@ WORTH_COMPILING = 1_000
 PLANNED_VIEWS = 64
 """Largest number of views that room is planned for."""
 GROWTH_ROOM = 1.5
-"""Room as a multiple of what the present model needs."""
+"""Pairs that lists may reach while a model is trained, as a multiple of the present ones."""
 
 Size = tuple[int, int]
 """Height and width of a view, in pixels."""
@@ -120,22 +120,8 @@ class Session:
         """Numbers of devices of a process and of processes."""
         self.shapes: set[Shape] = set()
         """Shapes of textures."""
-        self.capacities: dict[Hashable, set[int]] = {}
-        """Capacities of tile lists, by stage and image size."""
-
-    def capacity(self, place: Hashable, needed: int) -> int:
-        """Return the largest known capacity up to twice the pairs that are needed, or else a new one.
-
-        Capacities are kept by place, a stage and an image size.
-        """
-        capacities = self.capacities.setdefault(place, set())
-        # Few different capacities, at most half as large again as needed.
-        power = 2 ** (needed.bit_length() - 1)
-        rounded = next(room for room in (power, power + power // 2, 2 * power) if room >= needed)
-        # The largest, because lists that overflowed in an earlier run would overflow again.
-        capacity = max((room for room in capacities if needed <= room <= 2 * needed), default=rounded)
-        capacities.add(capacity)
-        return capacity
+        self.room = TileRoom()
+        """Capacities of tile lists, by appearance, rows and image size."""
 
 
 class StageRun:
@@ -202,7 +188,7 @@ class StageRun:
                 state = continued_state(stages[index - 1], self.stage, state)
         self.state = divided(self.mesh, self._with_room(state))
 
-        self.clock = self.stage.clock()._replace(largest_loss=largest_loss(self.history))
+        self.largest_loss = largest_loss(self.history)
         self.scene_scale = jnp.asarray(scene.scale, self.state.model.gaussians.means.dtype)
         self.key = jax.random.fold_in(jax.random.key(system.seed), index + 1)
         self.order = BatchOrder(self.views, system.batch_size, system.seed * 2 + index + 1, self.num_restored)
@@ -334,7 +320,7 @@ class StageRun:
             on_log(self._rows[-1])
         # The first logged loss decides which later one is an explosion.
         if len(self._rows) == 1:
-            self.clock = self.clock._replace(largest_loss=largest_loss(self.history))
+            self.largest_loss = largest_loss(self.history)
 
     # Steps
 
@@ -353,14 +339,15 @@ class StageRun:
 
     def _launch(self, iteration: int) -> StepInfo:
         arguments = self.arguments(iteration)
-        step = jitted_step()
-        num_programs = num_compiled(step)
         started = time.perf_counter()
         info: StepInfo
-        self.state, info = step(*arguments)
-        is_compiled = num_compiled(step) > num_programs
-        self.effects.launch(iteration, time.perf_counter() - started if is_compiled else None)
-        if is_compiled:
+        with compilations() as programs:
+            try:
+                self.state, info = jitted_step()(*arguments)
+            except ValueError as error:  # The step is not compiled for the name of its stage.
+                raise ValueError(f"stage {self.stage.name!r}: {error}") from error
+        self.effects.launch(iteration, time.perf_counter() - started if programs else None)
+        if programs:
             self.num_compiled += 1
             self.session.after_compiling()
         return info
@@ -369,13 +356,14 @@ class StageRun:
         """Return the arguments of the step of an iteration."""
         photographs, views = self.photographs.batch(iteration)
         render = self.render_settings(self._size(iteration))
+        clock = self.stage.clock(iteration, self.largest_loss)
         due = None
         if are_events_decided_by_host(self.state):
-            due = tuple(times is None or bool(times.is_due(iteration)) for times in self.clock.times)
+            due = tuple(left is None or left > 0 for left in clock.num_left)
         settings = StepSettings(render, self.system.background, due, self.mesh)
         rows = np.asarray(self.order.indices(iteration), np.int32) if self.stage.corrections else None
         rows = everywhere(self.mesh, rows)
-        return settings, self.stage, self.clock, self.state, photographs, views, self.scene_scale, self.key, rows
+        return settings, self.stage, clock, self.state, photographs, views, self.scene_scale, self.key, rows
 
     def _size(self, iteration: int) -> Size:
         return self.views[self.order.indices(iteration)[0]].picture.size
@@ -391,17 +379,14 @@ class StageRun:
             views = [view for view in self.views if view.picture.size == size]
             sample = evenly_chosen(views, PLANNED_VIEWS)
             cameras = [jax.tree.map(lambda x: jnp.asarray(x, dtype), view.camera) for view in sample]
-            pairs = max(
-                pairs_of_view(model.gaussians, camera, appearance, settings, model.num_live) for camera in cameras
-            )
+            pairs = most_pairs(model.gaussians, cameras, appearance, settings, model.num_live)
             growth = (model.gaussians.num / max(model.num, 1)) ** 0.5
-            self.capacities[size] = self._capacity(size, pairs * GROWTH_ROOM * growth)
+            self.capacities[size] = self.session.room.plan(self._place(size), pairs * GROWTH_ROOM * growth)
         return dataclasses.replace(settings, capacity=self.capacities[size])
 
-    def _capacity(self, size: Size, pairs: float) -> int:
-        """Return a capacity for a number of pairs in views of a size, if possible one of the session's."""
-        stage = self.stage.name, self.stage.appearance, self.state.model.gaussians.num
-        return self.session.capacity((*stage, *size), capacity_for(int(pairs)))
+    def _place(self, size: Size) -> tuple[object, ...]:
+        """Return the key of a capacity of the session: stages that show the same share it."""
+        return self.stage.appearance, self.state.model.gaussians.num, *size
 
     def _mend(self, iteration: int, info: StepInfo) -> None:
         """Make more room for the tile lists; raise an error for every other cause."""
@@ -410,7 +395,8 @@ class StageRun:
         if info.status == OVERFLOW:
             self.num_regrown += 1
             size = self._size(iteration)
-            self.capacities[size] = self._capacity(size, float(info.num_pairs) * GROWTH_ROOM)
+            pairs = GROWTH_ROOM * float(info.num_pairs)
+            self.capacities[size] = self.session.room.enlarge(self._place(size), pairs)
             return
         where = f"at iteration {iteration} of stage {self.stage.name}"
         if info.status in (NOT_FINITE, EXPLODED):
@@ -434,18 +420,18 @@ class StageRun:
 
     def _due_on_host(self) -> list[int]:
         """Return the iterations of all host events, and the last one of each step event whose statistic is dropped."""
-        count = self.stage.iterations
         due: list[int] = []
-        for event, times in zip(self.stage.events, self.clock.times, strict=True):
+        for event, times in zip(self.stage.events, self.stage.times, strict=True):
             if isinstance(event, HostEvent):
-                due += event.iterations(count)
-            elif times is not None and event.observes and self._is_worth_dropping(times.last):
-                due.append(times.last)
+                due += times
+            elif times and self._is_dropped_after(event, times[-1]):
+                due.append(times[-1])
         return due
 
-    def _is_worth_dropping(self, iteration: int) -> bool:
-        """Return whether enough iterations are left to compile a step without the statistics that nothing reads."""
-        return self.stage.iterations - iteration >= WORTH_COMPILING
+    def _is_dropped_after(self, event: Event, last: int) -> bool:
+        """Return whether what an event gathers is dropped after its last time: if enough iterations are left to compile
+        a step without the statistics that nothing reads."""
+        return event.observes and self.stage.iterations - last >= WORTH_COMPILING
 
     def _host_events(self, iteration: int) -> None:
         """Apply the host events that follow an iteration, and drop the statistics of past events."""
@@ -453,30 +439,29 @@ class StageRun:
             return
         if self.mesh is not None:
             self.state = jax.device_put(self.whole_state)
-        for place, (event, times) in enumerate(zip(self.stage.events, self.clock.times, strict=True)):
-            if not isinstance(event, HostEvent):
-                if times is not None and event.observes and iteration == times.last:
-                    self._keep(place, None)
+        for place, (event, times) in enumerate(zip(self.stage.events, self.stage.times, strict=True)):
+            if iteration not in times:
                 continue
-            due = event.iterations(self.stage.iterations)
-            if iteration not in due:
-                continue
-            background = BACKGROUNDS[self.system.background]
-            time_due = Due(
-                due.index(iteration) + 1, len(due), self.views, background=background, shapes=self.session.shapes
-            )
-            with calling(event, "apply", self.stage.name):
-                change = event.apply(time_due, self.state.model, self.state.moments, self.state.events[place])
-                change = checked_change(change)
-            self.effects.apply(place, self.state, change)
-            self.state = dataclasses.replace(self.state, model=change.model, moments=change.moments)
-            if change.rows is not None:  # Statistics of other events move along with the Gaussians.
-                pairs = zip(self.stage.events, self.state.events, strict=True)
-                states = (None if state is None else other.gather(state, change.rows) for other, state in pairs)
-                self.state = dataclasses.replace(self.state, events=tuple(states))
-            is_dropped = iteration == due[-1] and event.observes and self._is_worth_dropping(iteration)
-            self._keep(place, None if is_dropped else change.state)
+            if isinstance(event, HostEvent):
+                self._apply(place, event, times.index(iteration) + 1, len(times))
+            if iteration == times[-1] and self._is_dropped_after(event, iteration):
+                self._keep(place, None)
         self.state = divided(self.mesh, self.state)
+
+    def _apply(self, place: int, event: HostEvent, index: int, count: int) -> None:
+        """Apply the event at a place, for the `index`-th of `count` times."""
+        background = BACKGROUNDS[self.system.background]
+        due = Due(index, count, self.views, background=background, shapes=self.session.shapes)
+        with calling(event, "apply", self.stage.name):
+            change = event.apply(due, self.state.model, self.state.moments, self.state.events[place])
+            change = checked_change(change)
+        self.effects.apply(place, self.state, change)
+        self.state = dataclasses.replace(self.state, model=change.model, moments=change.moments)
+        if change.rows is not None:  # Statistics of other events move along with the Gaussians.
+            pairs = zip(self.stage.events, self.state.events, strict=True)
+            states = (None if state is None else other.gather(state, change.rows) for other, state in pairs)
+            self.state = dataclasses.replace(self.state, events=tuple(states))
+        self._keep(place, change.state)
 
     def _keep(self, place: int, state: object) -> None:
         """Replace the state of the event at a place."""

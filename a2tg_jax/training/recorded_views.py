@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from a2tg_jax.base.text import first_names, shortened
 from a2tg_jax.core.checks import check_shape
-from a2tg_jax.data.scene import View
-from a2tg_jax.host.text import first_names, shortened
+from a2tg_jax.scene import View
 
 UNKNOWN = -1
 """Checksum of pixels that were not read, or of a missing mask."""

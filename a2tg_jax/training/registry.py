@@ -5,8 +5,8 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
-from a2tg_jax.host.text import did_you_mean, shortened
-from a2tg_jax.io.config_json import config_from_dict, config_to_dict
+from a2tg_jax.base.text import did_you_mean, shortened
+from a2tg_jax.core.config_json import config_from_dict, config_to_dict
 from a2tg_jax.training.options import System
 
 SYSTEMS = {
@@ -84,7 +84,7 @@ def system_from_dict(data: Mapping[str, Any], where: str, kind: type[System] | N
     Args:
       data: name and options.
       where: name of the file in errors.
-      kind: class of the system; None: the class of that name.
+      kind: class of the system if no imported module has one of that name.
 
     Raises:
       ValueError: if the class is not known, or an option is missing, unknown or of another type.
@@ -93,11 +93,11 @@ def system_from_dict(data: Mapping[str, Any], where: str, kind: type[System] | N
         raise ValueError(f"{where}: does not name its system; it is damaged or of another version")
     name = data["name"]
     options = data["options"]
-    if kind is None and name in SYSTEMS:
+    if name in SYSTEMS:
         kind = type(find_system(name))
-    if kind is None:
-        module, _, attribute = str(name).partition(":")
-        kind = getattr(sys.modules.get(module), attribute, None)
+    else:
+        module, _, attribute = name.partition(":")
+        kind = getattr(sys.modules.get(module), attribute, kind)
     if not (isinstance(kind, type) and issubclass(kind, System)):
         raise ValueError(
             f"{where}: is of the system {shortened(name)!r}, which is not known here: import its module first"

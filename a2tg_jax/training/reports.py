@@ -10,17 +10,17 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.data.scene import View, view_image
-from a2tg_jax.events import Change, HostEvent, StepEvent
+from a2tg_jax.base.text import counted, in_bytes
+from a2tg_jax.events import Change, HostEvent, Times
 from a2tg_jax.host.progress_bars import has_terminal, is_line_due, new_bar
-from a2tg_jax.host.text import counted, in_bytes
+from a2tg_jax.scene import View, view_image
 from a2tg_jax.training.batches import BatchOrder
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Background, Stage
@@ -267,16 +267,17 @@ class StageEffects:
         self._stage = stage
         self._system = system
         self._num_sizes = num_sizes
-        self._on_host: dict[int, tuple[HostEvent, Effects]] = {
-            place: (event, Effects()) for place, event in enumerate(stage.events) if isinstance(event, HostEvent)
-        }
+        self._on_host: dict[int, tuple[HostEvent, Times, Effects]] = {}
+        for place, (event, times) in enumerate(zip(stage.events, stage.times, strict=True)):
+            if isinstance(event, HostEvent):
+                self._on_host[place] = event, times, Effects()
         self._reshaped_by: list[int] = []
         self._num_compiled = 0
         self._seconds = 0.0
 
     def apply(self, place: int, state: TrainState, change: Change) -> None:
         """Record a change of the state by the event at an index."""
-        _, effects = self._on_host[place]
+        _, _, effects = self._on_host[place]
         leaves, structure = jax.tree.flatten((state.model, state.moments, state.events[place]))
         new, new_structure = jax.tree.flatten((change.model, change.moments, change.state))
         is_reshaped: bool = structure != new_structure  # type: ignore[operator]
@@ -303,10 +304,10 @@ class StageEffects:
         self._num_compiled += 1
         self._seconds += seconds
         for place in dict.fromkeys(reshaped_by):
-            event, effects = self._on_host[place]
+            event, times, effects = self._on_host[place]
             effects.num_compiled += 1
             if effects.num_compiled == MANY_PROGRAMS and type(event).with_room is HostEvent.with_room:
-                left = len(self._ahead(event, iteration))
+                left = len(self._ahead(times, iteration))
                 warnings.warn(
                     f"stage {self._stage.name!r}: {type(event).__name__} has changed shapes {MANY_PROGRAMS} times, and "
                     f"each time a step was compiled, last for {seconds:.0f} s; it happens {counted(left, 'time')} "
@@ -319,12 +320,12 @@ class StageEffects:
         """Return the number of programs that events will cause from an iteration on, about."""
         num = 0.0
         length = self._stage.iterations
-        for event, effects in self._on_host.values():
-            left = len(self._ahead(event, iteration))
+        for event, times, effects in self._on_host.values():
+            left = len(self._ahead(times, iteration))
             if left and effects.num_applied:  # As often as so far.
                 num += left * effects.num_compiled / effects.num_applied
             elif left:
-                num += left * event.num_programs(length) / len(event.iterations(length))
+                num += left * event.num_programs(length) / len(times)
         return round(num * self._num_sizes)
 
     @property
@@ -332,22 +333,17 @@ class StageEffects:
         """Mean time of a compilation so far."""
         return self._seconds / max(1, self._num_compiled)
 
-    def _ahead(self, event: HostEvent, iteration: int) -> list[int]:
-        """Return the times of an event from an iteration on after which there are steps."""
-        end = self._stage.iterations
-        return [time for time in event.iterations(end) if iteration <= time < end]
+    def _ahead(self, times: Times, iteration: int) -> list[int]:
+        """Return the times from an iteration on after which there are steps."""
+        return [time for time in times if iteration <= time < self._stage.iterations]
 
     def warn_of_never(self) -> None:
         """Warn of events that never happen within the stage."""
         end = self._stage.iterations
-        for event in self._stage.events:
-            if isinstance(event, StepEvent):
-                times = event.times(end)
-                # The first multiple of `every` from `first` on.
-                first = max(1, -(-times.first // times.every)) * times.every if times.num_times else end
-            else:
-                due: Any = event.iterations(end) if isinstance(event, HostEvent) else ()
-                first = next((time for time in due if time >= 1), due[-1] if due else end)
+        for event, times in zip(self._stage.events, self._stage.times, strict=True):
+            if not times:
+                continue
+            first = next((time for time in times if time >= 1), times[-1])
             if not 1 <= first <= end:
                 warnings.warn(
                     f"stage {self._stage.name!r}: {self._system.path_of(event)} never happens: it is first due at "
@@ -358,8 +354,7 @@ class StageEffects:
     def warn_of_unused(self) -> None:
         """Warn of events that happened at all their times and never made a difference."""
         unused = []
-        for event, effects in self._on_host.values():
-            times = event.iterations(self._stage.iterations)
+        for event, times, effects in self._on_host.values():
             # In a resumed stage, the first times may have been before.
             if not effects.num_applied or effects.num_applied < len(times):
                 continue

@@ -10,23 +10,23 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from a2tg_jax.core.checks import check_kind, described, dtype_of
+from a2tg_jax.base.text import shortened
+from a2tg_jax.core.checks import check_kind, check_like, described, dtype_of
 from a2tg_jax.core.gaussians import check_gaussians
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import partition
 from a2tg_jax.events import Change, Event
-from a2tg_jax.host.text import shortened
-from a2tg_jax.io.validate import check_like
 from a2tg_jax.model import Model
 
 
 @contextlib.contextmanager
-def calling(event: Event, method: str, stage_name: str) -> Iterator[None]:
-    """Name the stage, the event and its method in errors of the block, which calls the method."""
+def calling(event: Event, method: str, stage_name: str | None = None) -> Iterator[None]:
+    """Name the event and its method in errors of the block, which calls the method, and the stage if it is given."""
     try:
         yield
     except (ValueError, ArithmeticError) as error:
-        raise ValueError(f"stage {stage_name!r}: {type(event).__name__}.{method}: {error}") from error
+        where = "" if stage_name is None else f"stage {stage_name!r}: "
+        raise ValueError(f"{where}{type(event).__name__}.{method}: {error}") from error
 
 
 def check_scalar(name: str, value: object) -> None:

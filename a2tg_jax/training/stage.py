@@ -1,11 +1,11 @@
 """A stage: an appearance, events, loss terms, learning rates and a length. A system is a sequence of stages."""
 
 import dataclasses
+import functools
 import inspect
 import math
 import numbers
 import re
-from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
 import jax
@@ -15,15 +15,15 @@ from jax import Array
 
 from a2tg_jax.appearance import Appearance, allocate_appearance, count_floats, in_words
 from a2tg_jax.appearance.base import check_appearance
+from a2tg_jax.base.text import shortened
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.checks import check_kind, check_literals, check_number, fields_of, kind_of
 from a2tg_jax.core.gaussians import Gaussians, no_rows
 from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.origin import BLACK, WHITE, Color
-from a2tg_jax.core.pytree import check_pytree, pytree, static
+from a2tg_jax.core.pytree import beside, check_pytree, pytree, static
 from a2tg_jax.core.sh import NUM_BASES
-from a2tg_jax.events import EVERY_ITERATION, Event, HostEvent, StepEvent, Times
-from a2tg_jax.host.text import shortened
+from a2tg_jax.events import Event, HostEvent, StepEvent, Times, every_iteration
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.render_types import RenderOutput
@@ -95,8 +95,9 @@ class LossTerm(Protocol):
 class Stage(NamedFields):
     """A part of training with one appearance, one loss and one schedule. A pytree: its numbers are traced."""
 
-    name: str = dataclasses.field(metadata={"static": True})
-    """A short word, unique in its system."""
+    name: str = beside()
+    """A short word, unique in its system. Steps do not depend on it, so that stages that differ in nothing else share
+    one program."""
     appearance: Appearance = dataclasses.field(metadata={"static": True})
     """Template of what the splats show: an appearance without arrays, such as `Appearance(texture=Texture())`."""
     events: tuple[Event, ...]
@@ -152,9 +153,10 @@ class Stage(NamedFields):
         appearance = allocate_appearance(self.appearance, jax.random.key(0), no_rows(2, 1))
         return BYTES_PER_FLOAT * count_floats(appearance, 0)
 
-    def is_ahead(self, event: Event) -> bool:
-        """Return whether an event happens at all (host)."""
-        return not isinstance(event, HostEvent) or bool(event.iterations(self.iterations))
+    @functools.cached_property
+    def times(self) -> tuple[Times, ...]:
+        """Iterations after which each event happens (host)."""
+        return tuple(event.times(self.iterations) for event in self.events)
 
     def check(self) -> None:
         """Check all fields.
@@ -186,19 +188,15 @@ class Stage(NamedFields):
                 part.check_options()
         for event in self.events:
             name = f"{where} {type(event).__name__}"
-            if isinstance(event, StepEvent):
-                with calling(event, "times", self.name):
-                    times = event.times(self.iterations)
-                check_kind(f"{name}.times: the result", times, Times)
-                check_number(f"{name}.times: every", times.every, least=1)
-            elif isinstance(event, HostEvent):
-                with calling(event, "iterations", self.name):
-                    due = event.iterations(self.iterations)
-                is_integers = isinstance(due, Sequence) and all(isinstance(num, int | np.integer) for num in due)
-                if not is_integers or list(due) != sorted(set(due)):
-                    raise ValueError(
-                        f"{name}.iterations must return ascending integers in a tuple; got {shortened(due)}"
-                    )
+            with calling(event, "times", self.name):
+                times = event.times(self.iterations)
+            is_ascending = isinstance(times, range) and times.step > 0
+            if isinstance(times, tuple | list) and all(isinstance(time, int | np.integer) for time in times):
+                is_ascending = list(times) == sorted(set(times))
+            if not is_ascending:
+                raise ValueError(
+                    f"{name}.times must return ascending integers, as a range or a tuple; got {shortened(times)}"
+                )
         names = [correction.name for correction in self.corrections]
         if len(set(names)) < len(names):
             raise ValueError(f"the corrections of {self.name!r} must have different names; got {', '.join(names)}")
@@ -252,31 +250,30 @@ class Stage(NamedFields):
 
     def lasting(self) -> tuple[int, ...]:
         """Return the indices of the events that happen after every iteration, such as noise (host)."""
-        return tuple(
-            index
-            for index, event in enumerate(self.events)
-            if isinstance(event, StepEvent) and event.times(self.iterations) == EVERY_ITERATION
-        )
+        all_iterations = every_iteration(self.iterations)
+        return tuple(index for index, times in enumerate(self.times) if times == all_iterations)
 
-    def clock(self) -> "Clock":
-        """Return the schedule for the step (host)."""
-        times: list[Times | None] = []
-        for event in self.events:
-            of_event = event.times(self.iterations) if isinstance(event, StepEvent) else None
+    def clock(self, iteration: int, largest_loss: float = math.inf) -> "Clock":
+        """Return the schedule for the step of an iteration, which is not taken beyond a loss (host)."""
+        num_left: list[int | None] = []
+        for event, times in zip(self.events, self.times, strict=True):
+            left = len(times) - times.index(iteration) if iteration in times else 0
             # An event of every iteration needs no condition in the step.
-            times.append(None if of_event == EVERY_ITERATION else of_event)
+            is_conditional = isinstance(event, StepEvent) and times != every_iteration(self.iterations)
+            num_left.append(left if is_conditional else None)
         return Clock(
             num_iterations=self.iterations,
             done=self.iterations if self.continues else 0,
             per_iteration=1.0 / self.iterations,
             log_decay=math.log(self.rates.means_final_factor),
             sh_interval=max(1, round(self.iterations / 30)),  # 1,000 of 30,000 iterations in 3DGS
-            times=tuple(times),
+            num_left=tuple(num_left),
+            largest_loss=largest_loss,
         )
 
 
 class Clock(NamedTuple):
-    """The schedule of a stage as numbers, traced in the step."""
+    """The schedule of a stage at an iteration as numbers, traced in the step."""
 
     num_iterations: int
     done: int
@@ -287,8 +284,9 @@ class Clock(NamedTuple):
     """Logarithm of the means' final factor."""
     sh_interval: int
     """Iterations between two degrees."""
-    times: tuple[Times | None, ...]
-    """Times of every event; None if it happens after every iteration, or on the host."""
+    num_left: tuple[int | None, ...]
+    """Number of times at which each event still happens, if it is due after this iteration, otherwise 0; None if it
+    happens after every iteration, or on the host."""
     largest_loss: float = math.inf
     """Largest loss; the step is not taken beyond it."""
 

@@ -13,20 +13,18 @@ from jax import Array
 from a2tg_jax.appearance import Appearance, allocate_appearance, template_of
 from a2tg_jax.appearance.base import check_appearance, join_rows, without_arrays
 from a2tg_jax.appearance.parts import Part, nearest_gaussians
+from a2tg_jax.base.text import shortened
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import fields_of
 from a2tg_jax.core.gaussians import INITIAL_OPACITY, Gaussians, init_from_points, no_rows
 from a2tg_jax.core.geometry import FILTER_VARIANCE, pixel_sizes
 from a2tg_jax.core.sh import NUM_BASES
+from a2tg_jax.core.sight import Sight, unseeing
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.core.table import Table, is_table, map_rows
-from a2tg_jax.data.assembly import Sight, unseeing
-from a2tg_jax.data.scene import Scene, View, check_view
 from a2tg_jax.events import LEAST_LEFT, Event
-from a2tg_jax.host.text import shortened
-from a2tg_jax.io.other_programs import plain_gaussians
-from a2tg_jax.io.validate import check_model
-from a2tg_jax.model import Model
+from a2tg_jax.model import Model, check_model, plain_gaussians
+from a2tg_jax.scene import Scene, View, check_view
 from a2tg_jax.training.losses import SSIM_WINDOW
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Stage

@@ -96,7 +96,9 @@ def initial_state(stage: Stage, model: Model, names: Sequence[str] = (), origin:
     return TrainState(
         model=model,
         moments=adam_init(partition(model)[0]),
-        events=tuple(event.init(model) if stage.is_ahead(event) else None for event in stage.events),
+        events=tuple(
+            event.init(model) if times else None for event, times in zip(stage.events, stage.times, strict=True)
+        ),
         iteration=jnp.zeros((), jnp.int32),
         status=jnp.zeros((), jnp.int32),
         corrections=initial_corrections(stage.corrections, names, origin, model.gaussians.means.dtype),
@@ -108,9 +110,9 @@ def continued_state(before: Stage, stage: Stage, state: TrainState) -> TrainStat
     state. Events that both stages hold continue as well."""
     state_of = {id(event): event_state for event, event_state in zip(before.events, state.events, strict=True)}
     events = []
-    for event in stage.events:
+    for event, times in zip(stage.events, stage.times, strict=True):
         event_state = state_of.get(id(event))
-        is_new = event_state is None and stage.is_ahead(event)
+        is_new = event_state is None and bool(times)
         events.append(event.init(state.model) if is_new else event_state)
     # Two arrays: the step takes over each buffer once.
     iteration = jnp.zeros((), jnp.int32)
@@ -148,7 +150,7 @@ class Attempt(NamedTuple):
 
 @functools.cache
 def jitted_step() -> jax.stages.Wrapped:
-    """Return `train_step`, jitted, with the state's buffers donated; its cache counts the traces."""
+    """Return `train_step`, jitted, with the state's buffers donated."""
     # Made at the first call: importing this library calls no `jax.jit`.
     return jax.jit(train_step, static_argnums=(0,), donate_argnums=(3,))
 
@@ -162,7 +164,7 @@ def train_step(
     Args:
       settings: static.
       stage: its numbers are traced.
-      clock: `stage.clock()`.
+      clock: `stage.clock(iteration)`.
       state: donated.
       photographs: of one image size.
       views: [V] int32 indices of the photographs to use; None: all of them.
@@ -234,7 +236,7 @@ def attempt(
     length = jnp.asarray(clock.num_iterations)
     now = Now(keys[1:], at, stage.cooled(rate, progress), length, scene_scale)
     change, events = _events(
-        settings.due, stage, clock, iteration, now, Seen(cameras, *statistic, colors), model, moments, state.events
+        settings.due, stage, clock, now, Seen(cameras, *statistic, colors), model, moments, state.events
     )
     corrections = tuple(
         updated(correction, correction_state, rows, grad, progress)  # type: ignore[arg-type]
@@ -299,7 +301,7 @@ def batch_gradients(
             else:
                 parts = {getattr(term, "name", type(term).__name__): term(model, target, output)}
             for name, part in parts.items():
-                check_scalar(f"stage {stage.name!r}: losses[{index}]", part)
+                check_scalar(f"losses[{index}]", part)
                 parts_by_name[name if name not in parts_by_name else f"{name}_{index + 1}"] = part
             values.append(functools.reduce(jnp.add, parts.values()))
         added = penalties(view.corrections, view.rows)
@@ -343,7 +345,7 @@ def optimized(stage: Stage, state: TrainState, grads: Any, rate_of_means: Array,
 
 
 def _events(
-    due: tuple[bool, ...] | None, stage: Stage, clock: Clock, iteration: Array, now: Now, seen: Seen, model: Model,
+    due: tuple[bool, ...] | None, stage: Stage, clock: Clock, now: Now, seen: Seen, model: Model,
     moments: AdamState, states: Sequence[Any],
 ) -> tuple[Change, tuple[Any, ...]]:  # fmt: skip
     """Gather statistics for the events, and apply those inside the step, which must keep all shapes."""
@@ -351,21 +353,19 @@ def _events(
     infos = nothing
     new_states = []
     first_key = 0
-    are_due = due or (None,) * len(stage.events)
-    for event, times, state, is_due in zip(stage.events, clock.times, states, are_due, strict=True):
-        name = f"stage {stage.name!r}: {type(event).__name__}"
+    for place, (event, num_left, state) in enumerate(zip(stage.events, clock.num_left, states, strict=True)):
         if state is not None and event.observes:
             observed = event.observe(state, model, seen)
-            check_kept(f"{name}.observe", observed, state)
+            check_kept(f"{type(event).__name__}.observe", observed, state)
             state = observed
         if isinstance(event, StepEvent):
             keys = now.keys[first_key : first_key + event.num_keys]
-            of_event = now._replace(keys=keys, times=times)
+            of_event = now._replace(keys=keys, num_left=None if num_left is None else jnp.asarray(num_left, jnp.int32))
             first_key += event.num_keys
 
             def apply(carry: tuple[Any, ...], event: StepEvent = event, now: Now = of_event) -> tuple[Any, ...]:
                 model, moments, state = carry
-                with calling(event, "apply", stage.name):
+                with calling(event, "apply"):
                     change = checked_change(event.apply(now, model, moments, state))
                     check_kept("model", change.model, model)
                     check_kept("state", change.state, state)
@@ -373,13 +373,18 @@ def _events(
                 info = EventInfo(jnp.asarray(is_possible), jnp.asarray(num_refused, jnp.int32))
                 return change.model, change.moments, change.state, info
 
+            def wait(carry: tuple[Any, ...]) -> tuple[Any, ...]:
+                return *carry, nothing
+
             carry = (model, moments, state)
-            info = nothing
-            if times is None or (is_due and state is not None):  # The state of an event that is past is None.
+            if num_left is None:  # It happens after every iteration.
                 model, moments, state, info = apply(carry)
-            elif is_due is None and state is not None:  # The step itself decides.
-                wait = lambda carry: (*carry, nothing)  # noqa: E731
-                model, moments, state, info = jax.lax.cond(times.is_due(iteration), apply, wait, carry)
+            elif state is None:  # It is past.
+                info = nothing
+            elif due is None:  # The step itself decides.
+                model, moments, state, info = jax.lax.cond(num_left > 0, apply, wait, carry)
+            else:
+                model, moments, state, info = apply(carry) if due[place] else wait(carry)
             infos = EventInfo(infos.is_possible & info.is_possible, infos.num_refused + info.num_refused)
         new_states.append(state)
     return Change(model, moments, None, infos), tuple(new_states)

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import a2tg_jax as a2tg
+from a2tg_jax.base.atomic import replacing
+from a2tg_jax.base.machine import cpu_quota, memory_limit
+from a2tg_jax.base.operating_system import num_cores
+from a2tg_jax.base.text import did_you_mean
 from a2tg_jax.data.synthetic import BUILT_IN
-from a2tg_jax.host.atomic import replacing
-from a2tg_jax.host.machine import cpu_quota, memory_limit
-from a2tg_jax.host.operating_system import num_cores
-from a2tg_jax.host.text import did_you_mean
 from a2tg_jax.measure.metrics import load_lpips
 from a2tg_jax.results.folder import write_json
 from lab import spreadsheet, tables, versions

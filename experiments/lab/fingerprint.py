@@ -8,21 +8,12 @@ import jax
 import numpy as np
 
 import a2tg_jax as a2tg
-from a2tg_jax.results.plan import common_options, is_equal
+from a2tg_jax.results.plan import common_options
 
 PACKAGE = "a2tg_jax"
 LATER_FIELDS = {"continues", "extent"}
 """Fields that came after the first records, which keep their keys: at their default they are no part of a fingerprint.
 """
-
-
-def is_same_so_far(made: a2tg.System, wanted: a2tg.System, index: int) -> bool:
-    """Return whether two systems train their stages up to `index` alike, whatever follows."""
-    if common_options(made) != common_options(wanted):
-        return False
-    stages = made.stages()
-    others = wanted.stages()
-    return all(is_equal(stages[at], others[at]) for at in range(index + 1))
 
 
 def fingerprint(system: a2tg.System, index: int) -> str:

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import a2tg_jax as a2tg
+from a2tg_jax.base.json_text import read_json
+from a2tg_jax.base.text import did_you_mean
 from a2tg_jax.core.budget import BYTES_PER_FLOAT, MEGABYTE
-from a2tg_jax.host.json_text import read_json
-from a2tg_jax.host.text import did_you_mean
-from a2tg_jax.io.config_json import changed_config, merged
+from a2tg_jax.core.config_json import changed_config, merged
 from lab.grid_file import (
     GRIDS,
     SIZES,
@@ -183,16 +183,18 @@ def _system(place: str, preset: str, method: Method, cell: Cell) -> a2tg.System:
 
 
 def seconds_of(job: Job, records: Mapping[str, Record]) -> float | None:
-    """Return the training time of a job and of those before it; None if one has not been timed.
+    """Return the training time of all stages up to a job; None if one has not been timed.
 
-    Records of before E6 have the time of their steps, without what happens between them.
+    Records from before E6 have the time of their steps, without what happens between them.
     """
-    chain = [job]
-    while chain[-1].start is not None:
-        chain.append(chain[-1].start)
-    found = [records.get(one.key, {}) for one in chain]
-    times = [record.get("training_seconds", record.get("step_seconds")) for record in found]
-    return None if None in times else sum(times)
+    total = 0.0
+    for stage in job.chain:
+        record = records.get(stage.key, {})
+        seconds = record.get("training_seconds", record.get("step_seconds"))
+        if seconds is None:
+            return None
+        total += seconds
+    return total
 
 
 def splats_in(mb: float, method: Method) -> int:

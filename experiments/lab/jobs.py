@@ -17,6 +17,8 @@ import jax
 import numpy as np
 
 import a2tg_jax as a2tg
+from a2tg_jax.base.json_text import read_json
+from a2tg_jax.base.machine import num_threads, tidy_memory
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.gaussians import floats_per_gaussian, no_rows
 from a2tg_jax.core.numerics import evenly_chosen
@@ -25,14 +27,14 @@ from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.data.assembly import with_validation_views
 from a2tg_jax.data.load import SceneSource
 from a2tg_jax.data.synthetic import BUILT_IN
-from a2tg_jax.host.json_text import read_json
-from a2tg_jax.host.machine import num_threads, tidy_memory
 from a2tg_jax.host.source_commit import source_commit
-from a2tg_jax.results.folder import write_json
+from a2tg_jax.results.folder import StageFiles, write_json
+from a2tg_jax.results.plan import PlannedStage
+from a2tg_jax.results.stage_training import train_stage
 from a2tg_jax.training import fit_stage
 from a2tg_jax.training.options import own_options
 from a2tg_jax.training.registry import reference_of
-from lab.fingerprint import fingerprint, is_same_so_far
+from lab.fingerprint import fingerprint
 from lab.scenes import few_views, from_random_points
 from lab.timing import TrainingTime
 from lab.versions import is_from_before
@@ -78,6 +80,17 @@ class Job:
         return dataclasses.replace(self, stage=self.stage - 1) if self.stage else None
 
     @property
+    def chain(self) -> tuple["Job", ...]:
+        """Return the jobs of all stages so far, this one last."""
+        return tuple(dataclasses.replace(self, stage=stage) for stage in range(self.stage + 1))
+
+    @property
+    def planned(self) -> PlannedStage:
+        """Return the stage under the name that its files have."""
+        start = None if self.start is None else self.start.planned
+        return PlannedStage(self.key, self.system, self.stage, start, self.system.stages()[self.stage])
+
+    @property
     def iterations(self) -> int:
         """Return the iterations of its stage."""
         return self.system.stages()[self.stage].iterations
@@ -85,7 +98,7 @@ class Job:
     @property
     def all_iterations(self) -> tuple[int, ...]:
         """Return the iterations of its stage and of those before it."""
-        return tuple(stage.iterations for stage in self.system.stages()[: self.stage + 1])
+        return tuple(job.iterations for job in self.chain)
 
     @property
     def key(self) -> str:
@@ -150,18 +163,24 @@ class Folders:
     lpips_network: str | None = None
     """Network of the weights; jobs measured with another one are measured again."""
 
+    @property
+    def files(self) -> StageFiles:
+        """Return models and checkpoints of stages, by the keys of their jobs."""
+        return StageFiles(self.work)
+
     def model(self, job: Job) -> Path:
-        return self.work / "models" / f"{job.key}.npz"
+        return self.files.model(job.key)
 
     def record(self, job: Job) -> Path:
         return self.work / "records" / f"{job.key}.json"
 
-    def checkpoint(self, job: Job) -> Path:
+    def former_checkpoint(self, job: Job) -> Path:
+        """Return the checkpoint of a sweep begun when checkpoints had no iteration in their names."""
         return self.work / "checkpoints" / f"{job.key}.npz"
 
     def time_so_far(self, job: Job) -> Path:
-        """Return the file with the training time up to the checkpoint."""
-        return self.checkpoint(job).with_suffix(".json")
+        """Return the file with the training time up to the newest checkpoint."""
+        return self.work / "checkpoints" / f"{job.key}.json"
 
     def shared(self, job: Job) -> Path:
         """Return the file whose presence says that others ran on the job's GPU or cores, also in an earlier call."""
@@ -209,7 +228,7 @@ def run_job(job: Job, folders: Folders, stop_at: float = math.inf) -> Record | N
     if folders.shared(job).is_file():
         record |= dict.fromkeys(times)
     write_json(_ready(path), record)
-    folders.checkpoint(job).unlink(missing_ok=True)
+    folders.files.drop_all_checkpoints(job.key)
     folders.time_so_far(job).unlink(missing_ok=True)
     return record
 
@@ -217,31 +236,31 @@ def run_job(job: Job, folders: Folders, stop_at: float = math.inf) -> Record | N
 def _train(job: Job, folders: Folders, scene: a2tg.Scene, stop_at: float) -> tuple[a2tg.StageResult, float | None]:
     """Return the result of the stage, and its time without compilation; None for that if a program that did not keep
     it had begun."""
-    path = _ready(folders.checkpoint(job))
     time_path = folders.time_so_far(job)
-    start = None if job.start is None else a2tg.load_model(folders.model(job.start))
-    checkpoint = _load_checkpoint(path, job) if path.is_file() else None
-    earlier = 0.0
-    if checkpoint is not None:
-        earlier = read_json(time_path) if time_path.is_file() else math.nan
+    training = TrainingTime()
 
-    def keep(checkpoint: a2tg.Checkpoint) -> None:
+    def take_time(checkpoint: a2tg.Checkpoint) -> None:
+        training.earlier = read_json(time_path) if time_path.is_file() else math.nan
+
+    def keep_time(checkpoint: a2tg.Checkpoint) -> None:
         write_json(time_path, training.seconds)
-        a2tg.save_checkpoint(path, checkpoint)
 
-    with TrainingTime(earlier) as training:
-        result = fit_stage(
-            scene,
-            job.system,
-            job.stage,
-            start,
-            resume=checkpoint,
-            on_checkpoint=keep,
-            checkpoint_every=max(500, job.iterations // 10),
-            progress=False,
-            is_stopped=lambda: time.monotonic() >= stop_at,
-            session=_session(),
-        )
+    def fit(*stage: Any, **options: Any) -> a2tg.StageResult:
+        with training:
+            return fit_stage(
+                scene,
+                *stage,
+                **options,
+                checkpoint_every=max(500, job.iterations // 10),
+                progress=False,
+                is_stopped=lambda: time.monotonic() >= stop_at,
+                session=_session(),
+            )
+
+    former = folders.former_checkpoint(job)
+    if former.is_file():
+        former.replace(folders.files.checkpoint(job.key, 0))  # Any other checkpoint is newer.
+    result = train_stage(folders.files, job.planned, scene, fit, on_resume=take_time, on_checkpoint=keep_time)
     return result, None if math.isnan(training.seconds) else training.seconds
 
 
@@ -249,14 +268,6 @@ def _train(job: Job, folders: Folders, scene: a2tg.Scene, stop_at: float) -> tup
 def _session() -> a2tg.Session:
     """Return the session that all jobs of this process share."""
     return a2tg.Session(after_compiling=tidy_memory)
-
-
-def _load_checkpoint(path: Path, job: Job) -> a2tg.Checkpoint:
-    """Return a checkpoint of this stage, which another system may share."""
-    checkpoint = a2tg.load_checkpoint(path)
-    if not is_same_so_far(checkpoint.system, job.system, job.stage):
-        raise ValueError(f"{path} was made with other numbers than {job.key} has: delete it")
-    return dataclasses.replace(checkpoint, system=job.system)
 
 
 def _training_facts(job: Job, scene: a2tg.Scene, result: a2tg.StageResult) -> Record:

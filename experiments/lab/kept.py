@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from a2tg_jax.host.json_text import read_json
-from a2tg_jax.host.text import shortened
+from a2tg_jax.base.json_text import read_json
+from a2tg_jax.base.text import shortened
 
 Figures = Mapping[str, Any]
 

@@ -8,7 +8,7 @@
 import re
 from pathlib import Path
 
-from a2tg_jax.host.atomic import replacing
+from a2tg_jax.base.atomic import replacing
 
 EXPERIMENTS = Path(__file__).resolve().parents[1]
 PAGES = (EXPERIMENTS.parent / "docs" / "results.md", EXPERIMENTS / "NOTEBOOK.md")

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 import a2tg_jax as a2tg
+from a2tg_jax.base.text import in_bytes
 from a2tg_jax.data.synthetic import BUILT_IN
 from a2tg_jax.events import HostEvent
-from a2tg_jax.host.text import in_bytes
 from a2tg_jax.training.cost import forecast_stages
 from lab.grid import Grid, Run
 from lab.jobs import Folders, Job, Record, model_bytes, num_gaussians

@@ -4,7 +4,7 @@ import datetime
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from a2tg_jax.host.text import counted
+from a2tg_jax.base.text import counted
 from lab.grid import Grid
 from lab.jobs import Job, Record
 from lab.queue import Failure

@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from a2tg_jax.host.text import shortened
+from a2tg_jax.base.text import shortened
 from lab.jobs import Folders, Job, Record, model_bytes, run_job
 
 POLL_SECONDS = 0.5

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 import a2tg_jax as a2tg
-from a2tg_jax.data.assembly import GREY, NUM_POINTS, Sight, random_points, unseeing
+from a2tg_jax.base.text import did_you_mean
+from a2tg_jax.core.sight import Sight, unseeing
+from a2tg_jax.data.assembly import GREY, NUM_POINTS, random_points
 from a2tg_jax.data.synthetic import BUILT_IN
-from a2tg_jax.host.text import did_you_mean
 from lab.grid_file import Block, table_as
 
 

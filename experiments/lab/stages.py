@@ -1,7 +1,7 @@
 """The stages of a sweep with the runs that need them, and their names in tables and logs."""
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 from lab.grid import Cell, Grid, Run
 from lab.grid_file import SUFFIX
@@ -36,7 +36,7 @@ def stages_of(grids: Sequence[Grid], records: Mapping[str, Record]) -> dict[str,
     found: dict[str, Stage] = {}
     for grid in grids:
         for run in grid.runs(guessed(grid, records)):
-            for job in chain(run.job):
+            for job in run.job.chain:
                 found.setdefault(job.key, Stage(job, run))
     return found
 
@@ -50,13 +50,6 @@ def check_systems(grids: Sequence[Grid], records: Mapping[str, Record]) -> None:
                 run.job.system.check()
             except ValueError as error:
                 raise ValueError(f"{grid.name}{SUFFIX}: {run.method.label!r}: {error}") from error
-
-
-def chain(job: Job) -> Iterator[Job]:
-    """Yield the jobs before a job, first the first, and the job."""
-    if job.start is not None:
-        yield from chain(job.start)
-    yield job
 
 
 def guessed(grid: Grid, records: Mapping[str, Record]) -> dict[str, Record]:

@@ -32,8 +32,8 @@ class TrainingTime:
     """
 
     def __init__(self, earlier: float = 0.0):
-        """`earlier` are the seconds of an interrupted training that the block goes on with."""
-        self._earlier = earlier
+        self.earlier = earlier
+        """Seconds of an interrupted training that the block continues."""
         self._clock = time.process_time if jax.default_backend() == "cpu" else time.perf_counter
         self._samples: list[tuple[float, float]] = []
         self._compiled: list[tuple[float, float]] = []
@@ -62,7 +62,7 @@ class TrainingTime:
         compiled = union(self._compiled)
         # Compilations are known by the time on the wall; samples say what the clock showed then.
         compiling = sum(np.interp(end, at, used) - np.interp(start, at, used) for start, end in compiled)
-        return self._earlier + float(used[-1] - used[0] - compiling)
+        return self.earlier + float(used[-1] - used[0] - compiling)
 
     def _sample(self) -> None:
         self._samples.append((time.perf_counter(), self._clock()))

@@ -11,11 +11,11 @@ import numpy as np
 from jaxlib.version import __version__ as jaxlib_version
 
 from a2tg_jax.appearance import Appearance, StaticShading, Texture, gaussian_cutoff
+from a2tg_jax.base.atomic import write_whole
+from a2tg_jax.base.machine import cache_folder
+from a2tg_jax.base.operating_system import cuda_of_driver
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.numerics import MOST_DIFFERENCE, relative_difference
-from a2tg_jax.host.atomic import write_whole
-from a2tg_jax.host.operating_system import cuda_of_driver
-from a2tg_jax.host.startup import cache_folder
 from a2tg_jax.rasterize.kernels import xla
 from a2tg_jax.rasterize.kernels.cuda import composite as cuda
 from a2tg_jax.rasterize.kernels.cuda.source import source

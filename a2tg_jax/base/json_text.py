@@ -9,9 +9,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from a2tg_jax.host.regular_files import read_regular
-from a2tg_jax.host.text import shortened
+import numpy as np
 
+from a2tg_jax.base.regular_files import read_regular
+from a2tg_jax.base.text import shortened
+
+LARGEST_FLOAT = float(np.finfo(np.float32).max)
 MOST_BYTES = 1 << 25
 """Largest JSON text; a scene of 10,000 photographs has a third of that."""
 MOST_TOML_BYTES = 1 << 18
@@ -133,3 +136,33 @@ def _parsed(parse: Callable[[], Any]) -> Any:
             if not level:
                 return value
     raise ValueError(f"its brackets are nested more than {DEEPEST} deep")
+
+
+def numbers_of(values: object, count: int | None, name: str, *, null: float | None = None) -> np.ndarray:
+    """Return a list of numbers in JSON as float64 [n].
+
+    Args:
+      values: the list.
+      count: its length; None: at least 1.
+      name: what errors call it.
+      null: the number that null stands for; None: null is an error.
+
+    Raises:
+      ValueError: if it is anything else, or a number is beyond the range of float32.
+    """
+
+    def is_number(value: object) -> bool:
+        if value is None:
+            return null is not None
+        # Not isinstance, because JSON's true is an int in Python.
+        return type(value) in (int, float) and abs(value) <= LARGEST_FLOAT  # type: ignore[arg-type]
+
+    if (
+        not isinstance(values, list)
+        or count not in (None, len(values))
+        or not values
+        or not all(map(is_number, values))
+    ):
+        wanted = f"{count or 'a list of'} finite numbers{'' if null is None else ' or null'}"
+        raise ValueError(f"{name} must be {wanted}; got {shortened(values)}")
+    return np.array([null if value is None else value for value in values], np.float64)

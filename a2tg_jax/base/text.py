@@ -1,10 +1,7 @@
 """Short texts for messages."""
 
 import difflib
-import shlex
 from collections.abc import Iterable, Sequence
-from pathlib import Path
-from typing import Any
 
 PROGRAM = "a2tg-jax"
 """Name of this program in files that it writes, as in the tag Software of pictures."""
@@ -17,19 +14,6 @@ def shortened(value: object, most: int = 80) -> str:
     text = " ".join((value if isinstance(value, str) else repr(value))[: 10 * most].split())
     text = "".join(letter if letter.isprintable() else "\ufffd" for letter in text[: most + 1])
     return text if len(text) <= most else f"{text[: most - 1]}…"
-
-
-def defaulting_to(text: str, metavar: str | None = None) -> Any:
-    """Return tyro's annotation of an option whose help describes its default in words, instead of None."""
-    from tyro.conf import arg  # Models are read without it.
-
-    return arg(help_behavior_hint=f"(default: {text})", metavar=metavar)
-
-
-def as_argument(path: Path) -> str:
-    """Return a path quoted for a shell, relative to the current folder if it is inside."""
-    here = Path.cwd()
-    return shlex.quote(str(path.relative_to(here) if path.is_relative_to(here) else path))
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING
 import psutil
 from jaxlib.version import __version__ as jaxlib_version
 
-from a2tg_jax.host.operating_system import keep_one_heap, num_cores, stack_bytes, trim_heap, ulimits
-from a2tg_jax.host.text import in_bytes
+from a2tg_jax.base.operating_system import keep_one_heap, num_cores, stack_bytes, trim_heap, ulimits
+from a2tg_jax.base.text import in_bytes
 
 if TYPE_CHECKING:
     import jax
@@ -273,3 +273,8 @@ def this_machine() -> Machine:
     device = jax.devices()[0]
     kind = f"{device.platform} {device.device_kind}"
     return Machine(jax.__version__, jaxlib_version, kind, processor_key(), num_threads())
+
+
+def cache_folder() -> Path:
+    """Return the cache folder: $XDG_CACHE_HOME/a2tg-jax, or ~/.cache/a2tg-jax."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "a2tg-jax"

@@ -5,31 +5,23 @@ import html
 import math
 import warnings
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from jax import Array
 
+from a2tg_jax.base.text import counted
 from a2tg_jax.core.cameras import Camera, check_camera, check_is_camera
 from a2tg_jax.core.checks import check_array, check_kind, check_number, check_shape
 from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.notebook_display import THUMBNAIL, enlarged, html_image, png
 from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.origin import BLACK, Origin
+from a2tg_jax.core.pictures import DepthMap, Mask, Picture
 from a2tg_jax.core.similarity import Similarity, check_similarity
-from a2tg_jax.data.photo_store import DepthMap, Mask, Picture
-from a2tg_jax.host.text import counted, in_bytes
 
-MANY_LENSES = 8
-"""Number of lenses beyond which it is likely that each photograph was calibrated alone."""
 LONGEST_PREVIEW = 800
 """Longest side in pixels of the picture of a view in a notebook."""
 NUM_THUMBNAILS = 8
-GENERIC_NAMES = {
-    "0", "capture", "colmap", "data", "dataset", "dense", "images", "input", "output", "photos", "scene", "sfm",
-    "sparse", "undistorted",
-}  # fmt: skip
-"""Names of folders, in lower case, that do not distinguish scenes."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -184,11 +176,11 @@ def origin_of_scene(scene: Scene) -> Origin:
 
 def kinds_of(views: Sequence[View]) -> list[tuple[int, int, int]]:
     """Return height, width and lens of each view. Lens 0 is a pinhole; others are numbered in order of appearance."""
-    numbers = {key: number for number, key in enumerate(_lenses(views), 1)}
+    numbers = {key: number for number, key in enumerate(rays_of_lenses(views), 1)}
     return [(*view.picture.size, numbers.get(id(view.camera.rays), 0)) for view in views]
 
 
-def _lenses(views: Sequence[View]) -> dict[int, Array]:
+def rays_of_lenses(views: Sequence[View]) -> dict[int, Array]:
     """Return the rays of each lens by their identity, in order of appearance; its views share the array."""
     # By identity: arrays have no hash, and lenses.Lens.rays gives views of one lens one array.
     return {id(view.camera.rays): view.camera.rays for view in views if view.camera.rays is not None}
@@ -196,19 +188,7 @@ def _lenses(views: Sequence[View]) -> dict[int, Array]:
 
 def ray_bytes(views: Sequence[View]) -> int:
     """Return the bytes of the rays of the views' lenses; views of one lens count once."""
-    return sum(int(rays.nbytes) for rays in _lenses(views).values())
-
-
-def warn_of_lenses(scene: Scene) -> None:
-    """Warn if most photographs have their own lens: the rays of each then take more memory than its pixels."""
-    views = [view for view in (*scene.train, *scene.test) if view.camera.rays is not None]
-    num = len(_lenses(views))
-    if num > MANY_LENSES and 2 * num > len(views):
-        warnings.warn(
-            f"{scene.name}: {len(views)} photographs have {num} lenses, whose rays take {in_bytes(ray_bytes(views))}: "
-            'calibrate photographs of one camera together, or undistort them (lens="undistort")',
-            stacklevel=3,
-        )
+    return sum(int(rays.nbytes) for rays in rays_of_lenses(views).values())
 
 
 def views_by_kind(views: Sequence[View]) -> list[list[View]]:
@@ -262,11 +242,3 @@ def view_image(view: View, background: Sequence[float] | np.ndarray | None = Non
         return color
     alpha = pixels[..., 3:].astype(np.float32) / np.float32(255)
     return alpha * color + (1 - alpha) * np.asarray(background, np.float32)
-
-
-def scene_name(folder: Path) -> str:
-    """Return the end of a folder's path, from the last name that says more than "scene" or "colmap" does."""
-    # The first part is the root, which is no name.
-    parts = folder.resolve().parts
-    specific = [at for at, part in enumerate(parts) if at and part.lower() not in GENERIC_NAMES]
-    return "/".join(parts[specific[-1] if specific else -1 :])

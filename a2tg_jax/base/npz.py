@@ -9,8 +9,8 @@ from typing import IO, Any
 
 import numpy as np
 
-from a2tg_jax.host.regular_files import open_regular, room_of
-from a2tg_jax.host.text import shortened
+from a2tg_jax.base.regular_files import open_regular, room_of
+from a2tg_jax.base.text import shortened
 
 LONGEST_HEADER = 10_000
 """Largest array header in bytes."""

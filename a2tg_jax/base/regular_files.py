@@ -3,13 +3,19 @@
 Links are followed if they lead to a regular file: reading a device never ends, and a pipe waits for a writer.
 """
 
+import contextlib
 import hashlib
 import os
 import re
 import stat
+from collections.abc import Iterator
 from io import BufferedReader
 from pathlib import Path
 
+from a2tg_jax.base.text import shortened
+
+LONGEST_REASON = 500
+"""Largest number of characters of an error that quotes a file."""
 MOST_ARRAY_BYTES = 1 << 34
 """Largest file of arrays: models, checkpoints, weights, point clouds and COLMAP's models."""
 LARGEST_RATIO = 64
@@ -105,3 +111,32 @@ def sha256_of(path: Path) -> str:
 
 def _refusal(path: str | os.PathLike[str]) -> str:
     return f"{path}: is not a regular file but a folder, device, pipe or socket; put a file there"
+
+
+def check_exists(path: str | os.PathLike[str], what: str) -> None:
+    """Raise FileNotFoundError, calling it `what`, unless there is a regular file."""
+    if not is_regular(path):
+        raise FileNotFoundError(f"{os.fspath(path)}: no such {what}")
+
+
+def existing_bytes(path: str | os.PathLike[str], what: str) -> bytes:
+    """Return the bytes of a regular file. FileNotFoundError, calling it `what`: there is none."""
+    check_exists(path, what)
+    return read_regular(path, MOST_ARRAY_BYTES)
+
+
+@contextlib.contextmanager
+def reading(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Turn errors about a file's content into one ValueError that names it."""
+    where = os.fspath(path)
+    try:
+        yield
+    except KeyError as error:
+        raise ValueError(f"{where}: lacks {shortened(str(error))}; it is damaged or of another version") from error
+    # What JSON of another shape than expected raises on access.
+    except (TypeError, IndexError, AttributeError, OverflowError, RecursionError) as error:
+        raise ValueError(f"{where}: is damaged or of another version ({shortened(repr(error))})") from error
+    except ValueError as error:
+        reason = shortened(str(error), LONGEST_REASON)
+        # Inner readers may have named the file already.
+        raise ValueError(reason if reason.startswith(where) else f"{where}: {reason}") from error

@@ -19,15 +19,16 @@ from a2tg_jax import appearance as built_in
 from a2tg_jax.appearance import Appearance, Bands, Exponents, Texture, TextureOptions, appearance_for
 from a2tg_jax.appearance.base import PARTS, template_of
 from a2tg_jax.appearance.files import arrays_of, with_arrays
+from a2tg_jax.base.archive import read_archive, write_archive
+from a2tg_jax.base.regular_files import reading
+from a2tg_jax.base.suffixes import check_suffix
+from a2tg_jax.base.text import shortened
 from a2tg_jax.core.checks import check_shape
+from a2tg_jax.core.config_json import config_from_dict, config_to_dict
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.origin import BLACK, Color, Origin
 from a2tg_jax.core.similarity import Similarity
-from a2tg_jax.host.text import shortened
-from a2tg_jax.io.archive import read_archive, write_archive
-from a2tg_jax.io.config_json import config_from_dict, config_to_dict
-from a2tg_jax.io.validate import check_model, check_suffix, live_model, reading
-from a2tg_jax.model import Model
+from a2tg_jax.model import Model, check_model, checked_live
 
 FORMAT = "a2tg-jax model"
 FIELDS = tuple(field.name for field in dataclasses.fields(Gaussians))
@@ -59,7 +60,8 @@ def save_model(path: str | os.PathLike[str], model: Model, header: Mapping[str, 
       >>> a2tg.load_model("scene.npz").num_bytes == model.num_bytes
       True
     """
-    model = live_model(path, model, "save_model")
+    check_suffix(path, "save_model")
+    model = checked_live(model)
     arrays = {name: np.asarray(getattr(model.gaussians, name)) for name in FIELDS}
     shown = arrays_of(model.appearance, model.gaussians.sh_degree)
     arrays |= {APPEARANCE + name: np.asarray(array) for name, array in shown.items()}

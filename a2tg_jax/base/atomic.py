@@ -12,7 +12,7 @@ from pathlib import Path
 
 import psutil
 
-from a2tg_jax.host.operating_system import flush_folder
+from a2tg_jax.base.operating_system import flush_folder
 
 PARTIAL = re.compile(r"\.(.+)\.(\d+)(?:@([^@]*))?\.partial")
 """Name of a partial file: the name of the final file, the process, and its machine, because disks may be shared.

@@ -10,12 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from a2tg_jax.host.atomic import replacing
-from a2tg_jax.host.json_text import parse_json
-from a2tg_jax.host.npz import read_npz
-from a2tg_jax.host.regular_files import expanded
-from a2tg_jax.host.text import shortened
-from a2tg_jax.io.validate import check_exists
+from a2tg_jax.base.atomic import replacing
+from a2tg_jax.base.json_text import parse_json
+from a2tg_jax.base.npz import read_npz
+from a2tg_jax.base.regular_files import check_exists, expanded
+from a2tg_jax.base.text import shortened
 
 FORMAT = "a2tg-jax checkpoint"
 VERSION = 1
