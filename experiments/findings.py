@@ -218,14 +218,16 @@ def rows_of_quick(grid: Grid, degree: int, records: Mapping[str, Record]) -> lis
 
 
 def rows_of_earlier_quick(grid: Grid, degree: int, records: Mapping[str, Record]) -> list[Row]:
-    """Return the comparisons of E1 at a degree by size, and plain degree 0 with degree 3 where both were run."""
+    """Return the comparisons of E1 at a degree by size, and plain degree 0 with degree 3 where both were run.
+
+    They are in the notebook alone.
+    """
     zero, three = (suffixed(MCMC, degree) + EQUAL_BYTES for degree in (0, 3))
     rows = []
+    own = {grid.reference.label: EARLIER}
     for size, results in tables.grouped(tables.results_of(grid, records), bytes_per_pixel):
         place = f"{size} bytes a pixel"
-        is_on_page = size == QUICK_SIZE
-        own = {grid.reference.label: EARLIER}
-        rows += rows_against(grid, degree, results, own, QUICK if is_on_page else place, is_on_page)
+        rows += rows_against(grid, degree, results, own, QUICK if size == QUICK_SIZE else place, is_on_page=False)
         rows.append(Row("plain: degree 0 − degree 3", results, zero, three, rows[-1].num_scenes, place, False))
     return rows
 

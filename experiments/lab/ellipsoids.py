@@ -99,7 +99,8 @@ class Gaussians3dMcmc(Gaussians2dMcmc):
 
     def stages(self) -> tuple[Stage, ...]:
         _, growth = grown_by_mcmc(self.densify, self.budget_cap(1))
-        events = EllipsoidNoise(), growth, *pruned(self.prune, self.stage1_iterations, densify_times)
+        pruning = pruned(self.prune, self.stage1_iterations, densify_times(self.stage1_iterations))
+        events = EllipsoidNoise(), growth, *pruning
         first = self.growing_stage(events, Ellipsoids(), {"log_thickness": self.rates.log_scales})
         stages = self.continued(first)
         if not self.weight:

@@ -26,7 +26,8 @@ class ShapedMcmc(Gaussians2dMcmc):
     def stages(self) -> tuple[Stage, ...]:
         kernels = kernels_of(self.kernel_rate, self.exponents)
         growth = grown_by_mcmc(self.densify, self.budget_cap(1))
-        events = *growth, *pruned(self.prune, self.stage1_iterations, densify_times), *kernels.limits
+        pruning = pruned(self.prune, self.stage1_iterations, densify_times(self.stage1_iterations))
+        events = *growth, *pruning, *kernels.limits
         first = self.growing_stage(events, a2tg.Appearance(exponents=kernels.part), kernels.rates)
         if not self.stage2_iterations:
             return (first,)
