@@ -99,8 +99,10 @@ class Gaussians3dMcmc(Gaussians2dMcmc):
 
     def stages(self) -> tuple[Stage, ...]:
         _, growth = grown_by_mcmc(self.densify, self.budget_cap(1))
-        events = EllipsoidNoise(), growth, *pruned(self.prune, self.stage1_iterations, densify_times)
-        first = self.growing_stage(events, Ellipsoids(), {"log_thickness": self.rates.log_scales})
+        pruning = pruned(self.prune, self.stage1_iterations, densify_times(self.stage1_iterations))
+        first = self.growing_stage(
+            (EllipsoidNoise(), growth, *pruning), Ellipsoids(), {"log_thickness": self.rates.log_scales}
+        )
         stages = self.continued(first)
         if not self.weight:
             return stages

@@ -26,8 +26,10 @@ class ShapedMcmc(Gaussians2dMcmc):
     def stages(self) -> tuple[Stage, ...]:
         kernels = kernels_of(self.kernel_rate, self.exponents)
         growth = grown_by_mcmc(self.densify, self.budget_cap(1))
-        events = *growth, *pruned(self.prune, self.stage1_iterations, densify_times), *kernels.limits
-        first = self.growing_stage(events, a2tg.Appearance(exponents=kernels.part), kernels.rates)
+        pruning = pruned(self.prune, self.stage1_iterations, densify_times(self.stage1_iterations))
+        first = self.growing_stage(
+            (*growth, *pruning, *kernels.limits), a2tg.Appearance(exponents=kernels.part), kernels.rates
+        )
         if not self.stage2_iterations:
             return (first,)
         return first, self.later_stage("continued", first.appearance, kernels.limits, kernels.rates)
