@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from jax import Array
 
-from a2tg_jax.base.text import counted
+from a2tg_jax.base.text import counted, shortened
 from a2tg_jax.core.cameras import Camera, check_camera, check_is_camera
 from a2tg_jax.core.checks import check_array, check_kind, check_number, check_shape
 from a2tg_jax.core.named_fields import NamedFields
@@ -115,7 +115,14 @@ class Scene(NamedFields):
 
 
 def check_scene(scene: Scene) -> None:
-    """Raise ValueError, naming the field, unless its numbers are valid and its training views have different names."""
+    """Raise ValueError, naming the field or the view, unless there are valid training views, of different names, and
+    all numbers are valid."""
+    if not isinstance(scene.train, tuple | list) or not all(isinstance(view, View) for view in scene.train):
+        raise ValueError(f"scene.train must be a tuple of views; got {shortened(scene.train)}")
+    if not scene.train:
+        raise ValueError("scene.train must hold at least one view; got none")
+    for view in scene.train:
+        check_view(view)
     names = [view.name for view in scene.train]
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)

@@ -100,7 +100,7 @@ def test_every_argument_and_result_is_described(name):
 
 INTERNAL = {
     "Clock", "CloneSplitPlan", "Coefficients", "Devices", "Event", "KernelRates", "Machine",
-    "RecordedViews", "RestOfRun", "Shape", "SplitStatistics", "StageRun", "TrainState",
+    "Progress", "RecordedViews", "Shape", "SplitStatistics", "TrainState",
     "ViewDependence",
 }  # fmt: skip
 """Types in public signatures whose values users only pass on, or give as mappings."""

@@ -35,7 +35,7 @@ from a2tg_jax.training import SYSTEMS, fitting, reports
 from a2tg_jax.training.corrections import sliced
 from a2tg_jax.training.cost import Bytes, check_rows_fit, forecast_stages, stage_bytes
 from a2tg_jax.training.loop import StageRun
-from a2tg_jax.training.reports import Pace, RestOfRun
+from a2tg_jax.training.reports import Pace, Progress, RestOfRun
 from a2tg_jax.training.start import initial_model
 from a2tg_jax.training.step import jitted_step
 
@@ -455,10 +455,14 @@ def test_a_run_is_forecast_with_its_later_stages_and_its_evaluation():
     assert after[first].iterations > 2 * views + plan[last].stage.iterations / 2 and after[first].programs > 2
 
 
+def stage_of(iterations):
+    return a2tg.Stage("a-stage", a2tg.Appearance(), (), (), a2tg.LearningRates(), iterations)
+
+
 @pytest.mark.parametrize("is_shown", [True, False])
 def test_the_pace_is_above_the_bar(capsys, monkeypatch, is_shown):
     monkeypatch.setattr(reports, "TIMED_SECONDS", 0.0)
-    with reports.ProgressBar("a-stage", 0, 100, is_shown=is_shown) as bar:
+    with reports.ProgressBar(Progress(is_shown), stage_of(100), 0) as bar:
         for done in (10, 20, 30):
             bar.tell_pace(done, 1)
     captured = capsys.readouterr()
@@ -483,7 +487,7 @@ def test_items_without_a_terminal_are_counted_in_plain_lines(capsys, monkeypatch
 def test_without_a_terminal_tenths_are_plain_lines(capsys, monkeypatch):
     monkeypatch.setattr(progress_bars, "PLAIN_SECONDS", 0.0)
     info = SimpleNamespace(loss=0.5, psnr=20.0)
-    with reports.ProgressBar("a-stage", 0, 20, is_shown=True) as bar:
+    with reports.ProgressBar(Progress(), stage_of(20), 0) as bar:
         for _ in range(20):
             bar.update(info, None)
     lines = capsys.readouterr().err.splitlines()
@@ -504,7 +508,7 @@ def test_in_a_notebook_a_bar_is_one_output(capsys, monkeypatch):
     monkeypatch.setattr(sys, "stderr", stream)
     assert list(progress_bars.progress_over([1, 2, 3], "frames", "frame")) == [1, 2, 3]
     info = SimpleNamespace(loss=0.5, psnr=20.0)
-    with reports.ProgressBar("a-stage", 0, 20, is_shown=True) as bar:
+    with reports.ProgressBar(Progress(), stage_of(20), 0) as bar:
         for _ in range(20):
             bar.update(info, None)
     frames, stage = outputs

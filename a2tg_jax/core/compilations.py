@@ -16,9 +16,9 @@ def compilations() -> Iterator[list[float]]:
     thread = threading.get_ident()
     durations: list[float] = []
 
-    def add(event: str, seconds: float, **_: object) -> None:
+    def add(event: str, duration_secs: float, **_: str | int) -> None:
         if event == COMPILED and threading.get_ident() == thread:
-            durations.append(seconds)
+            durations.append(duration_secs)
 
     jax.monitoring.register_event_duration_secs_listener(add)
     try:

@@ -42,6 +42,7 @@ from a2tg_jax.scene import Scene, View
 from a2tg_jax.systems.baselines import Gaussians2d
 from a2tg_jax.texture import NEUTRAL_TEXEL
 from a2tg_jax.training import fit_stage
+from a2tg_jax.training.reports import Progress
 from a2tg_jax.training.stage import BACKGROUNDS, Background
 
 MOST_GROWTH = 2.0
@@ -242,7 +243,7 @@ def distill(
     system = Gaussians2d(stage1_iterations=1, stage2_iterations=iterations, sh_degree=highest, background=behind)
     scene = drawn_scene(wanted, cameras, BACKGROUNDS[behind])
     start = dataclasses.replace(model, origin=None)
-    trained = fit_stage(scene, system, 1, start, progress=progress, title="bake").model
+    trained = fit_stage(scene, system, 1, start, progress=Progress(progress, "bake")).model
     return dataclasses.replace(trained, origin=wanted.origin)
 
 

@@ -43,6 +43,7 @@ from a2tg_jax.model import Model
 from a2tg_jax.scene import Scene
 from a2tg_jax.training import DivergedError, Stage, System, fit_stage
 from a2tg_jax.training.corrections import Correction
+from a2tg_jax.training.reports import Progress
 
 ITERATIONS = 1000
 LAST_ROUNDED = 0.95
@@ -311,7 +312,7 @@ def tune_compact(
     # Tuning changes no sizes, so no budget applies.
     shared |= {"memory_budget": None, "initial_gaussians": None, "sh_degree": start.gaussians.sh_degree}
     one_stage = _OneStage(**shared, stage=tuning)
-    tuned = fit_stage(scene, one_stage, 0, start, progress=progress, title=title).model
+    tuned = fit_stage(scene, one_stage, 0, start, progress=Progress(progress, title)).model
     return Tuned(dataclasses.replace(tuned, origin=start.origin), choices, grids)
 
 

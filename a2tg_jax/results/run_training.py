@@ -31,6 +31,7 @@ from a2tg_jax.scene import Scene
 from a2tg_jax.training import Checkpoint, DivergedError, Session, StageResult, fit_stage, save_checkpoint
 from a2tg_jax.training.loop import IsStopped, Watch, never, unwatched
 from a2tg_jax.training.registry import system_to_dict
+from a2tg_jax.training.reports import Progress
 from a2tg_jax.training.start import check_loss_data, check_start
 
 LESS_MEMORY = (
@@ -137,8 +138,8 @@ def _train_and_measure(run: RunFolder, record: RunRecord, scene: Scene, options:
     replaced run is restored if there is no checkpoint yet."""
     try:
         check_alike(record, scene, options.session)
-        with signals.noted() as is_stopped, options.watched(scene) as watch:
-            train_run(run, scene, options, is_stopped=is_stopped, watch=watch)
+        with signals.noted() as is_stopped, options.watched(scene) as options.session.watch:
+            train_run(run, scene, options, is_stopped=is_stopped)
         leave_others()
         result = evaluate_run(run, scene, lpips_weights=options.lpips_weights)
         if record.file_bytes is not None:
@@ -190,9 +191,7 @@ def _write_file(run: RunFolder, record: RunRecord, max_bytes: int, scene: Scene,
 # Training of the stages
 
 
-def train_run(
-    run: RunFolder, scene: Scene, options: RunOptions, *, is_stopped: IsStopped = never, watch: Watch = unwatched
-) -> None:
+def train_run(run: RunFolder, scene: Scene, options: RunOptions, *, is_stopped: IsStopped = never) -> None:
     """Train every stage of the run's record that is not finished yet, from its newest checkpoint. When a stage ends,
     its history and its model are written, and its checkpoints deleted.
 
@@ -205,9 +204,7 @@ def train_run(
     fit = functools.partial(
         fit_stage,
         scene,
-        progress=options.progress,
         is_stopped=is_stopped,
-        watch=watch,
         session=options.session,
         max_memory=options.max_memory,
     )
@@ -221,7 +218,8 @@ def train_run(
             check_finished(path, planned)
         else:
             events = EventWriter(run, name) if options.tensorboard else None
-            fit_this = functools.partial(fit, after=after[name], checkpoint_every=planned.checkpoint_every)
+            bar = Progress(options.progress, name, after[name])
+            fit_this = functools.partial(fit, progress=bar, checkpoint_every=planned.checkpoint_every)
             result = _train_stage(run, planned, scene, fit_this, events, record.on_nan)
             if events is not None:
                 events.add(result.history)

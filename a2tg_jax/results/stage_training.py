@@ -81,7 +81,6 @@ def train_stage(
         start,
         resume=resume,
         on_checkpoint=keep,
-        title=planned.name,
         num_restored=num_restored,
     )
 

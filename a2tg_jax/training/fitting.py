@@ -18,14 +18,14 @@ from a2tg_jax.data.synthetic import BUILT_IN
 from a2tg_jax.host import signals
 from a2tg_jax.model import Model
 from a2tg_jax.scene import Scene, check_scene, origin_of_scene
-from a2tg_jax.training.checkpoint import Checkpoint, History, check_resume
+from a2tg_jax.training.checkpoint import Checkpoint, History
 from a2tg_jax.training.corrections import corrected_origin
 from a2tg_jax.training.cost import check_rows_fit
-from a2tg_jax.training.loop import IsStopped, OnCheckpoint, OnLog, Session, StageRun, Watch, never, unwatched
+from a2tg_jax.training.loop import IsStopped, OnCheckpoint, OnLog, Session, StageRun, never
 from a2tg_jax.training.options import System
-from a2tg_jax.training.reports import RestOfRun
+from a2tg_jax.training.reports import Progress
 from a2tg_jax.training.stage import BACKGROUNDS
-from a2tg_jax.training.start import check_loss_data, check_start, check_views, given_start
+from a2tg_jax.training.start import checked_start
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -180,23 +180,19 @@ def fit(
         # A finished stage is not resumed if the next one continues it.
         if first + 1 < len(stages) and stages[first + 1].continues and resume.is_at_end:
             first += 1
-        check_resume(resume, system, first)
-    elif start is None:
-        check_start(scene, system)
-    else:
-        start = given_start(start, scene, system, 0)
-    check_loss_data(scene.train, stages[first:])
     session = session or Session()
+    start = checked_start(scene, system, first, start, resume, len(stages))
     if resume is None:
-        check_rows_fit(scene, system, 0, None if start is None else start.num, session.devices, max_memory)
+        check_rows_fit(scene, system, first, None if start is None else start.num, session.devices, max_memory)
     results: list[StageResult] = []
     with signals.noted((signals.CTRL_C,)) as is_interrupted:
+
+        def stops() -> bool:
+            return is_interrupted() or is_stopped()
+
         for index in range(first, len(stages)):
             run = StageRun(scene, system, index, start, resume, session=session)
-            run.train(
-                on_checkpoint, checkpoint_every, progress, is_stopped=lambda: is_interrupted() or is_stopped(),
-                on_log=on_log,
-            )  # fmt: skip
+            run.train(on_checkpoint, checkpoint_every, on_log, Progress(progress), stops)
             is_last = index == len(stages) - 1
             results.append(_result_of(run, scene, is_last=is_last))
             start = results[-1].model
@@ -242,7 +238,6 @@ def _check_arguments(
     if checkpoint_every is not None and checkpoint_every < 1:
         raise ValueError(f"checkpoint_every must be at least 1; got {checkpoint_every}")
     system.check()
-    check_views(scene.train)
     check_scene(scene)
 
 
@@ -253,16 +248,13 @@ def fit_stage(
     start: Model | None = None,
     *,
     resume: Checkpoint | None = None,
+    num_restored: int | None = None,
     on_checkpoint: OnCheckpoint | None = None,
     checkpoint_every: int | None = None,
     on_log: OnLog | None = None,
-    progress: bool = True,
-    title: str | None = None,
+    progress: bool | Progress = True,
     is_stopped: IsStopped = never,
-    num_restored: int | None = None,
-    watch: Watch = unwatched,
     session: Session | None = None,
-    after: RestOfRun = RestOfRun(),  # noqa: B008 - immutable
     max_memory: int | None = None,
 ) -> StageResult:
     """Train one stage of a system.
@@ -273,18 +265,14 @@ def fit_stage(
       index: stage, from 0.
       start: the model to start from, as in `fit`; not used with `resume`.
       resume: a checkpoint of this stage, or of the end of the stage that it continues; None: begin it.
+      num_restored: number of times the stage went back because it diverged; each number gives another order of the
+        views. None: the checkpoint's number, or 0.
       on_checkpoint: as in `fit`.
       checkpoint_every: as in `fit`.
       on_log: as in `fit`.
-      progress: show a progress bar.
-      title: title of the progress bar; None: the stage's name.
+      progress: show a progress bar; or its title, and what follows the stage.
       is_stopped: as in `fit`.
-      num_restored: number of times the stage went back because it diverged; each number gives another order of the
-        views. None: the checkpoint's number, or 0.
-      watch: function of the stage under way and of `is_stopped`, called between steps. It returns the seconds that it
-        waited, which do not count as training time.
       session: as in `fit`.
-      after: what follows the stage, for the remaining time that is shown.
       max_memory: as in `fit`.
 
     Returns:
@@ -303,16 +291,13 @@ def fit_stage(
     stages = system.all_stages()
     if not 0 <= index < len(stages):
         raise ValueError(f"index must be in 0..{len(stages) - 1}, one of the stages; got {index}")
-    check_loss_data(scene.train, stages[index : index + 1])
-    if resume is not None:
-        check_resume(resume, system, index)
-    elif start is not None:
-        start = given_start(start, scene, system, index)
     session = session or Session()
+    start = checked_start(scene, system, index, start, resume)
     if resume is None:
         check_rows_fit(scene, system, index, None if start is None else start.num, session.devices, max_memory)
     run = StageRun(scene, system, index, start, resume, num_restored, session)
-    run.train(on_checkpoint, checkpoint_every, progress, title, is_stopped, watch, on_log, after)
+    bar = progress if isinstance(progress, Progress) else Progress(progress)
+    run.train(on_checkpoint, checkpoint_every, on_log, bar, is_stopped)
     return _result_of(run, scene, is_last=index == len(stages) - 1)
 
 

@@ -20,7 +20,7 @@ from a2tg_jax.base.machine import Devices
 from a2tg_jax.core.compilations import compilations
 from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.table import Shape
-from a2tg_jax.events import Change, Due, Event, HostEvent, StepEvent
+from a2tg_jax.events import Due, Event, HostEvent, StepEvent
 from a2tg_jax.model import Model
 from a2tg_jax.parallel import any_process, check_batch_size, divided, everywhere, mesh_of, num_processes, whole
 from a2tg_jax.rasterize.render_types import RenderSettings
@@ -28,14 +28,13 @@ from a2tg_jax.rasterize.room import TileRoom, most_pairs
 from a2tg_jax.scene import Scene
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.checkpoint import COLUMNS, TERM, Checkpoint, History, Interrupted
-from a2tg_jax.training.corrections import check_corrections
 from a2tg_jax.training.divergence import DivergedError, largest_loss, what_diverged
 from a2tg_jax.training.options import System
 from a2tg_jax.training.recorded_views import RecordedViews
-from a2tg_jax.training.reports import LearningCheck, ProgressBar, RestOfRun, StageEffects
+from a2tg_jax.training.reports import LearningCheck, Progress, ProgressBar, StageEffects
 from a2tg_jax.training.returned import calling, checked_change
 from a2tg_jax.training.stage import BACKGROUNDS
-from a2tg_jax.training.start import initial_model, padded
+from a2tg_jax.training.start import state_of_checkpoint, state_of_start
 from a2tg_jax.training.step import (
     EXPLODED,
     FINE,
@@ -46,8 +45,6 @@ from a2tg_jax.training.step import (
     StepSettings,
     TrainState,
     attempt,
-    continued_state,
-    initial_state,
     jitted_step,
 )
 
@@ -93,25 +90,31 @@ def are_events_decided_by_host(state: TrainState) -> bool:
 
 
 class Session:
-    """Shapes that steps are compiled for, which trainings of one session reuse, and their devices.
+    """What trainings of one program share: devices, shapes that steps are compiled for, and a view of the training.
 
     `fit` makes a new session unless you pass one. Pass the same session to all trainings of a sweep. No result depends
     on the shapes; on several devices sums have another order, so that last digits differ.
     """
 
     def __init__(
-        self, after_compiling: Callable[[], object] = lambda: None, devices: Sequence[jax.Device] | None = None
+        self,
+        after_compiling: Callable[[], object] = lambda: None,
+        devices: Sequence[jax.Device] | None = None,
+        watch: Watch = unwatched,
     ):
         """Args:
         after_compiling: called after a step was compiled, such as `gc.collect`.
         devices: two or more devices that train one scene together, each with a share of the training state and of the
           views of a batch, such as `jax.devices()`; None: JAX's default device. If they are of several processes, each
           of these makes the same calls.
+        watch: function of the stage under way and of `is_stopped`, called between steps. It returns the seconds that it
+          waited, which do not count as training time.
 
         Raises:
           ValueError: if there is one device or none.
         """
         self.after_compiling = after_compiling
+        self.watch = watch
         self.mesh = mesh_of(devices)
         """Mesh of the devices; None: one device."""
         self.num_devices = 1 if self.mesh is None else self.mesh.size
@@ -153,8 +156,7 @@ class StageRun:
         self.system = system
         self.index = index
         self._recorded_views = RecordedViews.of(scene.train)
-        stages = system.all_stages()
-        self.stage = stages[index]
+        self.stage = system.all_stages()[index]
         resumed = resume if resume is not None and resume.stage == index else None
         if num_restored is None:
             num_restored = resumed.num_restored if resumed else 0
@@ -163,30 +165,11 @@ class StageRun:
         self._rows: list[dict[str, float]] = []
         """Rows of the history since then."""
 
-        def copied(tree: Any) -> Any:
-            return jax.device_put(tree, may_alias=False)  # Steps take over the buffers that they are given.
-
         if resume is None:
-            start = initial_model(scene, system) if start is None else start
-            model = padded(copied(start.live), self.stage, system, self.session.num_devices)
-            names = [view.name for view in self.views]
-            state = initial_state(self.stage, model, names, start.origin)
+            state = state_of_start(scene, system, index, start, self.session.num_devices)
         else:
-            check_corrections(resume.state.corrections, len(self.views))
-            if resume.views is not None:
-                resume.views.check(self.views)
-            num = resume.state.model.gaussians.num
-            num_devices = self.session.num_devices
-            if num % num_devices:
-                warnings.warn(
-                    f"the checkpoint has {num:,} rows, which {num_devices} devices cannot share evenly: each holds all "
-                    "of them until the stage ends",
-                    stacklevel=2,
-                )
-            state = copied(resume.state)
-            if resumed is None:
-                state = continued_state(stages[index - 1], self.stage, state)
-        self.state = divided(self.mesh, self._with_room(state))
+            state = state_of_checkpoint(scene, system, index, resume, self.session.num_devices)
+        self.state = divided(self.mesh, state)
 
         self.largest_loss = largest_loss(self.history)
         self.scene_scale = jnp.asarray(scene.scale, self.state.model.gaussians.means.dtype)
@@ -204,24 +187,8 @@ class StageRun:
         self.started = time.perf_counter()
         self.time_left: datetime.timedelta | None = None
         """Remaining time of the run, about; None at the beginning."""
-        self.num_regrown = self.num_compiled = 0
+        self.num_regrown = 0
         self.num_refused = resumed.num_refused if resumed else 0
-
-    def _with_room(self, state: TrainState) -> TrainState:
-        """Return the state, padded for what events will add between steps, so that no step is compiled again."""
-        model = state.model
-        moments = state.moments
-        num = model.num
-        num_bytes = float(model.num_bytes)
-        for event, event_state in zip(self.stage.events, state.events, strict=True):
-            if isinstance(event, HostEvent) and event_state is not None:
-                with calling(event, "with_room", self.stage.name):
-                    padding = Change(*event.with_room(model, moments, num_bytes, self.stage.iterations), event_state)
-                    padding = checked_change(padding)
-                model = padding.model
-                moments = padding.moments
-            num_bytes = event.most_bytes(num_bytes, num, self.stage.iterations)
-        return dataclasses.replace(state, model=model, moments=moments)
 
     @property
     def history(self) -> History:
@@ -254,12 +221,9 @@ class StageRun:
         self,
         on_checkpoint: OnCheckpoint | None = None,
         checkpoint_every: int | None = None,
-        progress: bool = True,
-        title: str | None = None,
-        is_stopped: IsStopped = never,
-        watch: Watch = unwatched,
         on_log: OnLog | None = None,
-        after: RestOfRun = RestOfRun(),  # noqa: B008 - immutable
+        progress: Progress = Progress(),  # noqa: B008 - immutable
+        is_stopped: IsStopped = never,
     ) -> None:
         """Run the stage to its end, then release its photographs. If it is stopped, write a last checkpoint and raise
         `Interrupted`.
@@ -269,9 +233,7 @@ class StageRun:
         self.effects.warn_of_never()
         # Several processes launch the same steps, and stop together.
         stops_launching = is_stopped if num_processes(self.mesh) == 1 else never
-        most = max((event.most_gaussians or 0 for event in self.stage.events), default=0)
-        title = title or self.stage.name
-        bar = ProgressBar(title, iteration, end, is_shown=progress, most_gaussians=most, after=after)
+        bar = ProgressBar(progress, self.stage, iteration)
         with contextlib.closing(self.photographs), bar:
             while iteration < end:
                 # Python acts after `launched` steps, and at events and checkpoints.
@@ -286,12 +248,13 @@ class StageRun:
                         self._log(iteration, info, on_log)
                     self.learning.observe(iteration, float(info.psnr))
                     bar.update(info, self._rows[-1] if self._rows else None)
-                ahead = self.effects.programs_ahead(iteration)
-                self.time_left = bar.tell_pace(iteration, self.num_compiled, ahead, self.effects.seconds_a_program)
+                effects = self.effects
+                ahead = effects.programs_ahead(iteration)
+                self.time_left = bar.tell_pace(iteration, effects.num_compiled, ahead, effects.seconds_a_program)
                 # `iteration` is less if a step could not be taken or training is being stopped.
                 if iteration == stop:
                     self._host_events(iteration)
-                self.started += watch(self, is_stopped)
+                self.started += self.session.watch(self, is_stopped)
                 must_stop = any_process(self.mesh, is_stopped())
                 is_due = checkpoint_every is not None and iteration % checkpoint_every == 0 and iteration == stop
                 if on_checkpoint is not None and (is_due or must_stop or iteration == end):
@@ -348,7 +311,6 @@ class StageRun:
                 raise ValueError(f"stage {self.stage.name!r}: {error}") from error
         self.effects.launch(iteration, time.perf_counter() - started if programs else None)
         if programs:
-            self.num_compiled += 1
             self.session.after_compiling()
         return info
 

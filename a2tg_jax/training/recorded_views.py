@@ -81,7 +81,7 @@ class RecordedViews:
             warnings.warn(
                 f"photographs or masks have changed since the checkpoint was made: {self._named(changed)}; what was "
                 "learned from the former ones stays in the model",
-                stacklevel=3,
+                stacklevel=4,
             )
 
     def _named(self, chosen: np.ndarray) -> str:

@@ -44,6 +44,17 @@ class RestOfRun(NamedTuple):
     """Number of programs to compile."""
 
 
+class Progress(NamedTuple):
+    """Progress bar of a stage."""
+
+    is_shown: bool = True
+    """False: there is none."""
+    title: str | None = None
+    """Its title; None: the stage's name."""
+    after: RestOfRun = RestOfRun()
+    """Work after the stage, for the remaining time that is shown."""
+
+
 class Pace:
     """Time of an iteration, and forecasts of a stage's duration: early, and at a half."""
 
@@ -103,11 +114,11 @@ class Pace:
 class ProgressBar:
     """A line with loss, PSNR, live Gaussians, memory and time left; a line for every tenth without a terminal."""
 
-    def __init__(
-        self, title: str, done: int, total: int, *, is_shown: bool, most_gaussians: int = 0,
-        after: RestOfRun = RestOfRun(),  # noqa: B008 - immutable
-    ):  # fmt: skip
-        is_bar = is_shown and has_terminal()
+    def __init__(self, progress: Progress, stage: Stage, done: int):
+        """`done` iterations of the stage were done before."""
+        title = progress.title or stage.name
+        total = stage.iterations
+        is_bar = progress.is_shown and has_terminal()
         self._bar = new_bar(
             desc=f"{title} (compiling)", initial=done, total=total, disable=not is_bar, unit="it",
             dynamic_ncols=True, mininterval=0.5, bar_format=BAR,
@@ -115,9 +126,10 @@ class ProgressBar:
         self._title = title
         self._done = done
         self._total = total
-        self._pace = Pace(done, total, most_gaussians=most_gaussians, after=after)
-        self._is_shown = is_shown
-        self._is_plain = is_shown and not is_bar
+        most = max((event.most_gaussians or 0 for event in stage.events), default=0)
+        self._pace = Pace(done, total, most_gaussians=most, after=progress.after)
+        self._is_shown = progress.is_shown
+        self._is_plain = progress.is_shown and not is_bar
         self._last_line = done, time.perf_counter()
         self._loss: float | None = None
         self._psnr = 0.0
@@ -272,7 +284,8 @@ class StageEffects:
             if isinstance(event, HostEvent):
                 self._on_host[place] = event, times, Effects()
         self._reshaped_by: list[int] = []
-        self._num_compiled = 0
+        self.num_compiled = 0
+        """Number of compiled steps so far."""
         self._seconds = 0.0
 
     def apply(self, place: int, state: TrainState, change: Change) -> None:
@@ -301,7 +314,7 @@ class StageEffects:
         self._reshaped_by = []
         if seconds is None:
             return
-        self._num_compiled += 1
+        self.num_compiled += 1
         self._seconds += seconds
         for place in dict.fromkeys(reshaped_by):
             event, times, effects = self._on_host[place]
@@ -331,7 +344,7 @@ class StageEffects:
     @property
     def seconds_a_program(self) -> float:
         """Mean time of a compilation so far."""
-        return self._seconds / max(1, self._num_compiled)
+        return self._seconds / max(1, self.num_compiled)
 
     def _ahead(self, times: Times, iteration: int) -> list[int]:
         """Return the times from an iteration on after which there are steps."""

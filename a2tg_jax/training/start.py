@@ -3,7 +3,7 @@
 import dataclasses
 import warnings
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,6 @@ from jax import Array
 from a2tg_jax.appearance import Appearance, allocate_appearance, template_of
 from a2tg_jax.appearance.base import check_appearance, join_rows, without_arrays
 from a2tg_jax.appearance.parts import Part, nearest_gaussians
-from a2tg_jax.base.text import shortened
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import fields_of
 from a2tg_jax.core.gaussians import INITIAL_OPACITY, Gaussians, init_from_points, no_rows
@@ -22,12 +21,18 @@ from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.sight import Sight, unseeing
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.core.table import Table, is_table, map_rows
-from a2tg_jax.events import LEAST_LEFT, Event
+from a2tg_jax.events import LEAST_LEFT, Change, Event, HostEvent
 from a2tg_jax.model import Model, check_model, plain_gaussians
-from a2tg_jax.scene import Scene, View, check_view
+from a2tg_jax.scene import Scene, View
+from a2tg_jax.training.checkpoint import Checkpoint, check_resume
+from a2tg_jax.training.corrections import check_corrections
 from a2tg_jax.training.losses import SSIM_WINDOW
 from a2tg_jax.training.options import System
+from a2tg_jax.training.returned import calling, checked_change
 from a2tg_jax.training.stage import Stage
+from a2tg_jax.training.step import TrainState, continued_state, initial_state
+
+T = TypeVar("T")
 
 KEY_OF_APPEARANCE = 0x7E8E1  # no stage's number, which is folded into the same key
 LEAST_OPACITY = INITIAL_OPACITY
@@ -37,6 +42,73 @@ GREY = 0.5
 """Colour of points without one."""
 GREY_SLACK = 0.01
 """Largest difference of a colour that counts as this grey."""
+
+
+def checked_start(
+    scene: Scene, system: System, index: int, start: Model | None, resume: Checkpoint | None, num_stages: int = 1
+) -> Model | None:
+    """Return the model from which training begins with a stage: None for Gaussians at the scene's points, or if a
+    checkpoint is resumed. Raises ValueError unless this stage and those after it, `num_stages` in all, can be trained.
+    """
+    check_loss_data(scene.train, system.all_stages()[index : index + num_stages])
+    if resume is not None:
+        check_resume(resume, system, index)
+        return None
+    if start is None:
+        check_start(scene, system)
+        return None
+    return given_start(start, scene, system, index)
+
+
+def state_of_start(scene: Scene, system: System, index: int, start: Model | None, num_devices: int) -> TrainState:
+    """Return the state before the first iteration of a stage, from a model or from Gaussians at the scene's points."""
+    stage = system.all_stages()[index]
+    start = initial_model(scene, system) if start is None else start
+    model = padded(copied(start.live), stage, system, num_devices)
+    return with_room(stage, initial_state(stage, model, [view.name for view in scene.train], start.origin))
+
+
+def state_of_checkpoint(scene: Scene, system: System, index: int, resume: Checkpoint, num_devices: int) -> TrainState:
+    """Return the state of a checkpoint of a stage, or, of the end of the stage before, the state before the first
+    iteration."""
+    check_corrections(resume.state.corrections, len(scene.train))
+    if resume.views is not None:
+        resume.views.check(scene.train)
+    num = resume.state.model.gaussians.num
+    if num % num_devices:
+        warnings.warn(
+            f"the checkpoint has {num:,} rows, which {num_devices} devices cannot share evenly: each holds all of them "
+            "until the stage ends",
+            stacklevel=2,
+        )
+    stages = system.all_stages()
+    state = copied(resume.state)
+    if resume.stage != index:
+        state = continued_state(stages[index - 1], stages[index], state)
+    return with_room(stages[index], state)
+
+
+def copied(tree: T) -> T:
+    """Return a pytree on the device with buffers that a step may take over."""
+    placed: T = jax.device_put(tree, may_alias=False)
+    return placed
+
+
+def with_room(stage: Stage, state: TrainState) -> TrainState:
+    """Return the state, padded for what events will add between steps, so that no step is compiled again."""
+    model = state.model
+    moments = state.moments
+    num = model.num
+    num_bytes = float(model.num_bytes)
+    for event, event_state in zip(stage.events, state.events, strict=True):
+        if isinstance(event, HostEvent) and event_state is not None:
+            with calling(event, "with_room", stage.name):
+                padding = Change(*event.with_room(model, moments, num_bytes, stage.iterations), event_state)
+                padding = checked_change(padding)
+            model = padding.model
+            moments = padding.moments
+        num_bytes = event.most_bytes(num_bytes, num, stage.iterations)
+    return dataclasses.replace(state, model=model, moments=moments)
 
 
 def initial_model(scene: Scene, system: System) -> Model:
@@ -144,17 +216,6 @@ def check_loss_data(views: tuple[View, ...], stages: Sequence[Stage]) -> None:
         )
 
 
-def check_views(views: tuple[View, ...]) -> None:
-    """Raise ValueError, naming the view, unless there are photographs, uint8, of their cameras' sizes, of which some
-    pixels count."""
-    if not isinstance(views, tuple | list) or not all(isinstance(view, View) for view in views):
-        raise ValueError(f"scene.train must be a tuple of views; got {shortened(views)}")
-    if not views:
-        raise ValueError("scene.train must hold at least one view; got none")
-    for view in views:
-        check_view(view)
-
-
 def given_start(start: Model, scene: Scene, system: System, index: int) -> Model:
     """Return a model that a stage is to start from, with spherical harmonics of the degree at which training begins.
 
@@ -186,14 +247,14 @@ def given_start(start: Model, scene: Scene, system: System, index: int) -> Model
         warnings.warn(
             f"initial_gaussians of {system.initial_gaussians:,} does not apply: training starts from the {num:,} "
             "Gaussians of start",
-            stacklevel=3,
+            stacklevel=4,
         )
     transform = scene.transform if start.origin is None else start.origin.transform
     if not _are_close(transform, scene.transform):
         warnings.warn(
             "start was made in another world than the scene's, so that its Gaussians are elsewhere: give "
             "start.transform(start.origin.transform.inverse().then(scene.transform))",
-            stacklevel=3,
+            stacklevel=4,
         )
     _check_seen("start.gaussians.means", np.asarray(start.gaussians.means), scene)
     template = template_of(start.appearance)
@@ -208,7 +269,7 @@ def given_start(start: Model, scene: Scene, system: System, index: int) -> Model
         )
     lost = left_out(start, degree, None if is_expected else stage.appearance)
     if lost:
-        warnings.warn(f"start: stage {stage.name!r} leaves out {' and '.join(lost)}", stacklevel=3)
+        warnings.warn(f"start: stage {stage.name!r} leaves out {' and '.join(lost)}", stacklevel=4)
     if is_expected:
         return dataclasses.replace(start, gaussians=with_degree(start.gaussians, degree))
     keeps_shapes = stage.appearance.exponents is not None
