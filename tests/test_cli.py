@@ -101,6 +101,10 @@ def test_nothing_is_overwritten_before_the_new_run_is_checked(capsys, tmp_path, 
     assert run.report.read_text() == "old"
 
 
+def test_training_without_a_scene_says_so(capsys, tmp_path):
+    assert "SCENE is missing" in fails(capsys, "train", "--out", tmp_path / "run")
+
+
 def run_python(*words: str, **environment: str) -> subprocess.CompletedProcess:
     environment = {**os.environ, **environment}
     return subprocess.run([sys.executable, *words], capture_output=True, text=True, check=False, env=environment)

@@ -167,6 +167,8 @@ class Train:
     """Time without a sign of life after which a process counts as lost and the others stop, with --coordinator."""
 
     def run(self) -> None:
+        if not self.record.scene.path:
+            raise ValueError("SCENE is missing: a folder, or built in, synthetic or cells: a2tg train SCENE --out RUN")
         # Processes must join before anything starts the devices of JAX.
         with joined(self.place, lambda: f"continue with: {resuming_command(RunFolder(self.out))}"):
             session = Session(after_compiling=tidy_memory, devices=devices_named(self.devices))
@@ -309,10 +311,7 @@ def train_defaults(arguments: Sequence[str]) -> Train:
     # A resumed run keeps its system and preset; `resumed` reports other ones.
     if not given.resume and (given.preset or given.system not in ("", record.system)):
         record = record.with_system(given.system or record.system, given.preset or None)
-    scene = record.scene
-    if not scene.path:  # tyro requires what is MISSING.
-        scene = dataclasses.replace(scene, path=tyro.MISSING)
-    return Train(dataclasses.replace(record, scene=scene), tyro.MISSING)
+    return Train(record, tyro.MISSING)  # tyro requires what is MISSING.
 
 
 def scene_rule(info: StructTypeInfo) -> StructConstructorSpec | None:
