@@ -18,7 +18,7 @@ from a2tg_jax import (
 )
 from a2tg_jax.rasterize.kernels import platforms, window_scores
 from a2tg_jax.rasterize.kernels.native import ffi
-from a2tg_jax.rasterize.kernels.window_scores import Score
+from a2tg_jax.rasterize.kernels.score import Score
 from a2tg_jax.training.losses import depth_normals, live_mean, mean_ssim
 from a2tg_jax.training.terms import opacity, scale
 

@@ -506,7 +506,7 @@ def test_a_signal_in_training_keeps_its_state(scene, stopped, tmp_path, monkeypa
 
 
 def test_a_second_signal_ends_the_program_at_once():
-    with pytest.raises(signals.Stopped) as raised, signals.noted() as is_asked:
+    with pytest.raises(signals.Stopped) as raised, signals.stop_on_signals() as is_asked:
         assert not is_asked()
         os.kill(os.getpid(), signal.SIGINT)
         assert is_asked()
