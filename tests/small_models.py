@@ -1,12 +1,15 @@
 """A model and a checkpoint of every system, of a dozen Gaussians, made without training; random weights of LPIPS."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import a2tg_jax as a2tg
-from a2tg_jax import Checkpoint, History, Model, Now, Origin, allocate_appearance, init_from_points
-from a2tg_jax.training.checkpoint import COLUMNS, TERM
+from a2tg_jax import Bands, Checkpoint, History, Model, Now, Origin, allocate_appearance, init_from_points
+from a2tg_jax.appearance import template_of
+from a2tg_jax.appearance.parts import bands_of_dense
 from a2tg_jax.training.step import initial_state
 
 NUM = 12
@@ -30,12 +33,21 @@ def some_model(system=None):
     return Model(gaussians, appearance, origin=some_origin())
 
 
+def with_bands(model, dense, degrees):
+    """The model with spherical harmonics [N, K, 3] above its own degree, up to a degree for each Gaussian."""
+    bands = Bands(bands_of_dense(np.asarray(dense), np.asarray(degrees), model.gaussians.sh_degree))
+    return dataclasses.replace(model, appearance=dataclasses.replace(model.appearance, bands=bands))
+
+
+def assert_same_rule(found, wanted):
+    """The appearances of two models are alike in all but their arrays."""
+    assert template_of(found.appearance) == template_of(wanted.appearance)
+
+
 def with_row(history: History, *values: float, **terms: float) -> History:
     """The history with a further row: values in the order of the fields, and loss terms by name."""
-    row = dict(zip(COLUMNS, values, strict=True))
-    for name, value in terms.items():
-        row[f"{TERM}{name}"] = value
-    return history.followed_by(History.of_rows([row]))
+    columns = (np.asarray([value]) for value in values)
+    return history.followed_by(History(*columns, {name: np.asarray([value]) for name, value in terms.items()}))
 
 
 def some_checkpoint(system):
