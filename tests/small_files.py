@@ -17,6 +17,12 @@ MAGIC = b"a2tgz\r\n\x1a"
 GROUPS = tuple(field.name for field in dataclasses.fields(CompactChoices) if field.name != "coder")
 EXACT = CompactChoices(**dict.fromkeys(GROUPS, "float32"))
 DEFAULT = CompactChoices()
+SCALES = ("scale_0", "scale_1")
+ATTRIBUTES = (
+    "x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(45)), "opacity",
+    *SCALES, *(f"rot_{i}" for i in range(4)),
+)  # fmt: skip
+"""Columns of splats in PLY."""
 
 
 def compact_bytes(model: Model, choices: CompactChoices = DEFAULT, grids=None) -> bytes:
@@ -50,6 +56,17 @@ def with_header_text(text: bytes, body: bytes = b"", num_text: int | None = None
     rest = coded + body
     num_text = len(text) if num_text is None else num_text
     return HEAD.pack(MAGIC, 3, len(coded), num_text, zlib.crc32(rest)) + rest
+
+
+def half_turned(model: Model) -> Model:
+    """The model as its file without rounding has it."""
+    return model_in(compact_bytes(model, EXACT))
+
+
+def grids_of(model: Model, choices: CompactChoices) -> dict[str, tuple[float, ...]]:
+    """First and last steps of the groups in bits, as a file names them."""
+    header, _ = taken_apart(compact_bytes(model, dataclasses.replace(choices, coder="none")))
+    return {name: tuple(ends) for name, ends in header["ends"].items()}
 
 
 def read_archive(path: Path) -> tuple[dict, dict[str, np.ndarray]]:

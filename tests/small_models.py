@@ -39,9 +39,42 @@ def with_bands(model, dense, degrees):
     return dataclasses.replace(model, appearance=dataclasses.replace(model.appearance, bands=bands))
 
 
+def movable_kernels(**changes):
+    """The appearance of SuperGaussians."""
+    return dataclasses.replace(a2tg.SuperGaussians().stages()[0].appearance, **changes)
+
+
+def billboards(**changes):
+    """The appearance of BBSplat."""
+    return dataclasses.replace(a2tg.BBSplat().stages()[0].appearance, **changes)
+
+
+def rule_of(appearance):
+    """The appearance without its arrays: its class, parts and options."""
+    return template_of(appearance)
+
+
 def assert_same_rule(found, wanted):
-    """The appearances of two models are alike in all but their arrays."""
-    assert template_of(found.appearance) == template_of(wanted.appearance)
+    assert rule_of(found.appearance) == rule_of(wanted.appearance)
+
+
+def numbers_of(model):
+    """All numbers of a model by name, of any padding."""
+    numbers = {field.name: getattr(model.gaussians, field.name) for field in dataclasses.fields(model.gaussians)}
+    numbers |= {"sh": model.sh, "degrees": model.degrees}
+    if model.textures is not None:
+        numbers |= {"sizes": model.textures.sizes, "texels": model.textures.flat()}
+    if model.appearance.shapes is not None:
+        numbers["shapes"] = model.appearance.shapes
+    return {name: np.asarray(values) for name, values in numbers.items()}
+
+
+def origin_of(scene):
+    """The origin of a model that was trained on a scene."""
+    views = [*scene.train, *scene.test]
+    is_test = [False] * len(scene.train) + [True] * len(scene.test)
+    names = [view.name for view in views]
+    return Origin.of_cameras([view.camera for view in views], names, is_test=is_test, transform=scene.transform)
 
 
 def with_row(history: History, *values: float, **terms: float) -> History:

@@ -26,8 +26,8 @@ from small_files import (
     taken_apart,
     with_header_text,
 )
-from small_models import assert_same_rule, with_bands
-from small_values import some_gaussians
+from small_models import assert_same_rule, billboards, movable_kernels, with_bands
+from small_values import rotations, some_gaussians
 
 from a2tg_jax import (
     Appearance,
@@ -47,7 +47,6 @@ from a2tg_jax import (
     save_compact,
     textures_from_arrays,
 )
-from a2tg_jax.appearance import Billboards, MovableKernels
 from a2tg_jax.io.columns import decode, encode
 from a2tg_jax.io.web_scene import encode_web_scene, importance
 
@@ -159,10 +158,7 @@ def test_floats_come_back_as_they_were_in_another_order(name, tmp_path):
     for group, values in tables(found).items():
         wanted = tables(model, order)[group]
         np.testing.assert_allclose(values, wanted, rtol=0, atol=1e-6 if group == "texels" else 0)
-    got, wanted = (
-        Rotation.from_quat(np.asarray(quats), scalar_first=True).as_matrix()[:, :, 2]
-        for quats in (found.gaussians.quats, model.gaussians.quats[order])
-    )
+    got, wanted = (rotations(quats)[:, :, 2] for quats in (found.gaussians.quats, model.gaussians.quats[order]))
     np.testing.assert_allclose(np.abs(got), np.abs(wanted), atol=2e-6)
 
 
@@ -340,7 +336,7 @@ def test_shapes_of_any_precision_are_finite(bits):
 @pytest.mark.parametrize(("encode_it", "file"), [(compact_bytes, "compact file"), (encode_web_scene, "for browsers")])
 def test_models_that_a_file_cannot_hold_are_refused(encode_it, file):
     gaussians = some_gaussians()
-    templates = {"MovableKernels with bands": MovableKernels(bands=Bands()), "Billboards": Billboards()}
+    templates = {"MovableKernels with bands": movable_kernels(bands=Bands()), "Billboards": billboards()}
     for words, template in templates.items():
         appearance = allocate_appearance(template, jax.random.key(0), gaussians)
         with pytest.raises(ValueError, match=f"has {words}: a .*{file} holds .*save_model"):

@@ -97,7 +97,8 @@ def test_the_command_to_go_on_names_devices_and_processes(tmp_path):
     path.parent.mkdir()
     path.write_bytes(b"damaged")
     assert resuming_command(run) == f"a2tg train --out {tmp_path} --resume"
-    write_archive(path, {"devices": {"each": 4, "processes": 1}}, {})
+    header = {"format": "a2tg-jax checkpoint", "version": 1, "devices": {"each": 4, "processes": 1}}
+    write_archive(path, header, {})
     assert resuming_command(run) == f"a2tg train --out {tmp_path} --resume --devices 4"
     by_two = "--devices 1 --coordinator HOST:PORT --num-processes 2 --process-id I"
     assert resuming_command(run, Devices(1, 2)) == f"a2tg train --out {tmp_path} --resume {by_two}"
