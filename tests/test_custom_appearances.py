@@ -152,8 +152,8 @@ CASES = {
     ),
     "painted": Case("painted", painted, True, 53),
     "shaped": Case("shaped", shaped, True, 53),
-    "movable kernels": Case("movable", movable_kernels, False, 1),
-    "billboards": Case("billboard", billboards, False, 0),
+    "movable kernels": Case("movable", movable, False, 1),
+    "billboards": Case("billboard", pictured, False, 0),
 }
 FAST = ("movable kernels", "painted")
 """The cases whose gradients the default tests compare."""
@@ -286,7 +286,7 @@ def test_the_statistic_takes_the_way_of_the_falloff(compositor):
     by_mean, statistic = differentiate(gaussians, probe, glossy(arrays))
     assert jnp.max(jnp.abs(by_mean.means)) > 1e-2
     np.testing.assert_allclose(statistic[:, :3], jnp.abs(by_mean.means), atol=1e-12)
-    _, statistic = differentiate(gaussians, probe, billboards(random_arrays("billboard", len(scene.means))))
+    _, statistic = differentiate(gaussians, probe, pictured(random_arrays("billboard", len(scene.means))))
     np.testing.assert_array_equal(statistic[:, :3], 0)
 
 

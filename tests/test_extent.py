@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from run_folders import RECORD, create_run
-from small_files import put_together, taken_apart
+from small_files import put_together, read_archive, taken_apart, write_archive
 from small_models import assert_same_rule, some_checkpoint, some_model
 
 import a2tg_jax as a2tg
-from a2tg_jax.base.archive import read_archive, write_archive
 from a2tg_jax.cli.main import main
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.results.record import read_record, write_record

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from run_folders import create_run
+from small_files import write_archive
 from small_models import assert_same_rule, movable_kernels
 from small_values import some_gaussians
 
@@ -34,7 +35,6 @@ from a2tg_jax import (
     synthetic_scene,
     transform_gaussians,
 )
-from a2tg_jax.base.archive import write_archive
 from a2tg_jax.cli.main import main
 from a2tg_jax.io.formats import FORMATS, file_bytes, files_of, format_of, lost_by, unseen_elsewhere
 from a2tg_jax.model_file import number_in_file

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hostile_files import put
+from small_files import read_archive, write_archive
 from small_models import NUM, some_checkpoint, some_gaussians, some_model
 
 import a2tg_jax as a2tg
@@ -31,7 +32,6 @@ from a2tg_jax import (
     save_model,
     save_ply,
 )
-from a2tg_jax.base.archive import read_archive, write_archive
 from a2tg_jax.base.json_text import parse_json
 from a2tg_jax.base.npz import read_npz
 from a2tg_jax.core.table import check_places

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes_random import as_camera, as_gaussians, draw_scene
+from small_files import read_archive, write_archive
 from small_models import assert_same_rule
 from small_values import assert_same, some_gaussians, some_world
 from test_hostile_models import refused, spoiled, with_array, with_header
@@ -34,7 +35,6 @@ from a2tg_jax import (
     textures_from_arrays,
     to_gsplat,
 )
-from a2tg_jax.base.archive import read_archive, write_archive
 
 SIZES = [(1, 1), (4, 2), (1, 4), (2, 2), (4, 2), (1, 1), (3, 5)]
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from on_processes import SHORT, ended, free_port, pair, started, survivor_of, trainings
 from run_folders import create_run
+from small_files import write_archive
 
 import a2tg_jax as a2tg
 from a2tg_jax import Session, fit_stage, load_model
-from a2tg_jax.base.archive import write_archive
 from a2tg_jax.base.machine import Devices
 from a2tg_jax.cli import main as cli
 from a2tg_jax.cli.processes import LOST, is_lost

@@ -9,6 +9,7 @@ import oracle
 import pytest
 from scenes_random import as_camera, as_gaussians, draw_scene
 from scipy.spatial.transform import Rotation
+from small_files import read_archive, write_archive
 from small_models import assert_same_rule, billboards, movable_kernels, rule_of, with_bands
 from small_values import some_gaussians
 
@@ -36,7 +37,6 @@ from a2tg_jax import (
     save_ply,
 )
 from a2tg_jax.appearance.parts import empty_bands, floats_of_band, sizes_of_degrees
-from a2tg_jax.base.archive import read_archive, write_archive
 from a2tg_jax.core.budget import within_budget
 from a2tg_jax.core.table import Shape, bucket_capacity, resize
 from a2tg_jax.densify.view_dependence import ViewDependence, most_blocks, raised_degrees, without_idle
