@@ -16,11 +16,10 @@ from a2tg_jax import (
     init_from_points,
     normal_consistency,
     photometric_loss,
-    ssim as kernel,
     value_and_grad,
 )
 from a2tg_jax.rasterize.kernels import platforms, window_scores
-from a2tg_jax.rasterize.kernels.native import ffi
+from a2tg_jax.rasterize.kernels.native import ffi, ssim as kernel
 from a2tg_jax.rasterize.kernels.score import Score
 from a2tg_jax.training.losses import depth_normals, mean_ssim
 
