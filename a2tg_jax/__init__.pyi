@@ -73,7 +73,9 @@ from .finish.compaction import (
 from .finish.polishing import polish as polish
 from .finish.shrinking import shrink_textures as shrink_textures
 from .finish.tuning import Tuned as Tuned, tune_compact as tune_compact
+from .host.signals import stop_on_signals as stop_on_signals
 from .host.startup import configure_cpu as configure_cpu
+from .host.training_bar import ProgressBar as ProgressBar
 from .io.compact import CompactChoices as CompactChoices, load_compact as load_compact, save_compact as save_compact
 from .io.edit_file import Box as Box, Edit as Edit, apply_edit as apply_edit, load_edit as load_edit
 from .io.formats import load_splats as load_splats, save_splats as save_splats
@@ -173,6 +175,7 @@ from .training.gradients import (
 )
 from .training.losses import normal_consistency as normal_consistency, photometric_loss as photometric_loss
 from .training.options import Corrections as Corrections
+from .training.reports import Display as Display
 from .training.stage import LossTerm as LossTerm
 
 __version__: str

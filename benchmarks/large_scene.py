@@ -74,7 +74,7 @@ def measure(case: dict) -> dict:
     found["held"], found["photographs_bytes"] = sum(p.is_held for p in pictures), sum(p.nbytes for p in pictures)
     found["load_seconds"], found["load_peak"] = loaded - start, memory_peak()
     short = a2tg_jax.Gaussians2dMcmc(stage1_iterations=ITERATIONS, densify=system.densify)
-    result = a2tg_jax.fit(scene, short, progress=False)
+    result = a2tg_jax.fit(scene, short)
     found["train_seconds"], found["train_peak"] = result.seconds, memory_peak()
     found["psnr"] = a2tg_jax.evaluate(scene.test[:1], result.model).psnr
     return {**case, **found, "peak": memory_peak()}

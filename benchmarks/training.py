@@ -23,15 +23,15 @@ def measure_training(case: dict) -> dict:
         densify=Mcmc(cap=case["num"]),
     )
     plain = like(Gaussians2dMcmc, textured)
-    first = fit_stage(scene, textured, 0, progress=False)
+    first = fit_stage(scene, textured, 0)
     height, width = scene.train[0].picture.size
     return {
         "scene": scene.name,
         "image": [width, height],
         "num_live": first.model.num,
         "stage1_ms": late_step_ms(first.history),
-        "untextured_ms": late_step_ms(fit_stage(scene, plain, 1, first.model, progress=False).history),
-        "textured_ms": late_step_ms(fit_stage(scene, textured, 1, first.model, progress=False).history),
+        "untextured_ms": late_step_ms(fit_stage(scene, plain, 1, first.model).history),
+        "textured_ms": late_step_ms(fit_stage(scene, textured, 1, first.model).history),
     }
 
 

@@ -87,7 +87,7 @@ def _seconds_per_step(lab: Lab, job: Job, scene: a2tg.Scene) -> float:
     start = a2tg.load_model(lab.folders.model(job if job.stage == 0 else dataclasses.replace(job, stage=0)))
     paces = []
     for _ in range(rounds):
-        history = fit_stage(scene, system, job.stage, start, progress=False).history
+        history = fit_stage(scene, system, job.stage, start).history
         paces.append(float(np.median(np.diff(history.seconds) / np.diff(history.iteration))))
     return min(paces)
 

@@ -14,6 +14,7 @@ from fuzz_mutate import zipped
 from fuzz_readers import PICTURES
 from PIL import Image
 from run_folders import create_run
+from small_files import ATTRIBUTES
 from small_models import some_checkpoint, some_model, with_row
 from test_captures import write_metashape, write_polycam_with_depth, write_realityscan, write_record3d
 from test_data_colmap import CAMERAS, write_scene as write_colmap
@@ -36,7 +37,6 @@ from a2tg_jax import (
     save_ply,
 )
 from a2tg_jax.data.colmap_library import pycolmap
-from a2tg_jax.io.ply import ATTRIBUTES
 from a2tg_jax.results.folder import RunFolder, write_json as write_run_json
 from a2tg_jax.results.history import write_history
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record

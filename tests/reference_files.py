@@ -12,10 +12,10 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
+from small_models import with_bands
 
 from a2tg_jax import (
     Appearance,
-    Bands,
     Camera,
     Exponents,
     Gaussians,
@@ -29,7 +29,6 @@ from a2tg_jax import (
     save_compact,
     textures_from_arrays,
 )
-from a2tg_jax.appearance.parts import bands_of_dense, log_exponents_of
 from a2tg_jax.io.web_scene import encode_web_scene
 
 NUM = 10
@@ -52,7 +51,6 @@ def reference_model(has_alpha: bool = True) -> Model:
             array[..., 3] = 1.0
     textures = textures_from_arrays(arrays)
     sh = draw(NUM, 16, 3, scale=0.4)
-    bands = bands_of_dense(sh[:, 1:], np.arange(NUM) % 4, 0)
     gaussians = Gaussians(
         draw(NUM, 3), draw(NUM, 4), draw(NUM, 2, scale=0.5) - np.float32(2), draw(NUM), draw(NUM, 1, 3)
     )  # type: ignore[arg-type]
@@ -61,9 +59,8 @@ def reference_model(has_alpha: bool = True) -> Model:
     camera = Camera(viewmat, np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), 64, 48)  # type: ignore[arg-type]
     world = Similarity(0.5, np.eye(3)[[1, 2, 0]], np.array([1.0, 2.0, 3.0]))
     origin = Origin.of_cameras([camera], ["a.png"], transform=world)
-    return Model(
-        gaussians, Appearance(texture=Texture(textures), bands=Bands(bands)), background=BACKGROUND, origin=origin
-    )
+    model = Model(gaussians, Appearance(texture=Texture(textures)), background=BACKGROUND, origin=origin)
+    return with_bands(model, sh[:, 1:], np.arange(NUM) % 4)
 
 
 def shaped_model() -> Model:
@@ -83,7 +80,7 @@ def numbers(model: Model) -> dict[str, np.ndarray]:
     fields = {name: getattr(model.gaussians, name) for name in ("means", "quats", "log_scales", "opacities")}
     found = fields | {"degrees": model.degrees, "sh": model.sh, "sizes": textures.sizes, "texels": textures.flat()}
     if shapes is not None:
-        found["exponents"] = np.exp(log_exponents_of(shapes))
+        found["exponents"] = np.exp(np.tanh(np.asarray(shapes, np.float64)))
     return {name: np.asarray(values, np.float64) for name, values in found.items()}
 
 

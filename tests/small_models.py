@@ -1,12 +1,15 @@
 """A model and a checkpoint of every system, of a dozen Gaussians, made without training; random weights of LPIPS."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import a2tg_jax as a2tg
-from a2tg_jax import Checkpoint, History, Model, Now, Origin, allocate_appearance, init_from_points
-from a2tg_jax.training.checkpoint import COLUMNS, TERM
+from a2tg_jax import Bands, Checkpoint, History, Model, Now, Origin, allocate_appearance, init_from_points
+from a2tg_jax.appearance import template_of
+from a2tg_jax.appearance.parts import bands_of_dense
 from a2tg_jax.training.step import initial_state
 
 NUM = 12
@@ -30,12 +33,54 @@ def some_model(system=None):
     return Model(gaussians, appearance, origin=some_origin())
 
 
+def with_bands(model, dense, degrees):
+    """The model with spherical harmonics [N, K, 3] above its own degree, up to a degree for each Gaussian."""
+    bands = Bands(bands_of_dense(np.asarray(dense), np.asarray(degrees), model.gaussians.sh_degree))
+    return dataclasses.replace(model, appearance=dataclasses.replace(model.appearance, bands=bands))
+
+
+def movable_kernels(**changes):
+    """The appearance of SuperGaussians."""
+    return dataclasses.replace(a2tg.SuperGaussians().stages()[0].appearance, **changes)
+
+
+def billboards(**changes):
+    """The appearance of BBSplat."""
+    return dataclasses.replace(a2tg.BBSplat().stages()[0].appearance, **changes)
+
+
+def rule_of(appearance):
+    """The appearance without its arrays: its class, parts and options."""
+    return template_of(appearance)
+
+
+def assert_same_rule(found, wanted):
+    assert rule_of(found.appearance) == rule_of(wanted.appearance)
+
+
+def numbers_of(model):
+    """All numbers of a model by name, of any padding."""
+    numbers = {field.name: getattr(model.gaussians, field.name) for field in dataclasses.fields(model.gaussians)}
+    numbers |= {"sh": model.sh, "degrees": model.degrees}
+    if model.textures is not None:
+        numbers |= {"sizes": model.textures.sizes, "texels": model.textures.flat()}
+    if model.appearance.shapes is not None:
+        numbers["shapes"] = model.appearance.shapes
+    return {name: np.asarray(values) for name, values in numbers.items()}
+
+
+def origin_of(scene):
+    """The origin of a model that was trained on a scene."""
+    views = [*scene.train, *scene.test]
+    is_test = [False] * len(scene.train) + [True] * len(scene.test)
+    names = [view.name for view in views]
+    return Origin.of_cameras([view.camera for view in views], names, is_test=is_test, transform=scene.transform)
+
+
 def with_row(history: History, *values: float, **terms: float) -> History:
     """The history with a further row: values in the order of the fields, and loss terms by name."""
-    row = dict(zip(COLUMNS, values, strict=True))
-    for name, value in terms.items():
-        row[f"{TERM}{name}"] = value
-    return history.followed_by(History.of_rows([row]))
+    columns = (np.asarray([value]) for value in values)
+    return history.followed_by(History(*columns, {name: np.asarray([value]) for name, value in terms.items()}))
 
 
 def some_checkpoint(system):

@@ -6,6 +6,7 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_values import moved_by
 
 from a2tg_jax import (
     Corrections,
@@ -20,7 +21,6 @@ from a2tg_jax import (
     synthetic_scene,
 )
 from a2tg_jax.cli.main import main
-from a2tg_jax.core.cameras import moved_viewmat
 from a2tg_jax.measure import alignment
 
 TWIST = np.array([0.018, -0.012, 0.009, 0.012, -0.009, 0.015])
@@ -42,7 +42,7 @@ def model(scene, system):
 
 
 def moved(view, twist):
-    viewmat = moved_viewmat(jnp.asarray(twist, jnp.float32), view.camera.viewmat)
+    viewmat = jnp.asarray(moved_by(twist, view.camera.viewmat))
     return dataclasses.replace(view, camera=dataclasses.replace(view.camera, viewmat=viewmat))
 
 

@@ -6,7 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.scipy.special import logit
 from scenes_random import as_camera, as_gaussians, draw_scene
+from small_models import billboards, movable_kernels, rule_of
 from test_oracle import FACING, FOCAL, hand_scene
 
 import a2tg_jax as a2tg
@@ -26,10 +28,10 @@ from a2tg_jax import (
     render_appearance,
     save_model,
 )
-from a2tg_jax.appearance import Billboards, MovableKernels, appearance_for, count_floats, in_words, template_of
+from a2tg_jax.appearance import appearance_for, in_words
 from a2tg_jax.appearance.base import clear_rows
 from a2tg_jax.appearance.files import arrays_of
-from a2tg_jax.core.gaussians import logit, share
+from a2tg_jax.core.gaussians import share
 from a2tg_jax.events import gather_rows
 
 KEY = jax.random.key(0)
@@ -37,8 +39,8 @@ TEXTURED = Appearance(texture=Texture(start=(2, 3)))
 APPEARANCES = {
     "plain": Appearance(),
     "textured": TEXTURED,
-    "movable kernels": MovableKernels(),
-    "billboards": Billboards(side=5),
+    "movable kernels": movable_kernels(),
+    "billboards": billboards(side=5),
     "shaped": dataclasses.replace(TEXTURED, exponents=Exponents()),
 }
 
@@ -61,7 +63,7 @@ def test_models_are_saved_with_what_they_show(name, tmp_path):
     model = Model(gaussians, moved(appearance), num_live=jnp.int32(30))
     save_model(tmp_path / "model.npz", model)
     loaded = load_model(tmp_path / "model.npz")
-    assert template_of(loaded.appearance) == APPEARANCES[name] and loaded.num == 30
+    assert rule_of(loaded.appearance) == APPEARANCES[name] and loaded.num == 30
     wanted, found = (arrays_of(own.live.appearance, gaussians.sh_degree) for own in (model, loaded))
     assert wanted.keys() == found.keys()
     for key in wanted:
@@ -95,16 +97,22 @@ def test_parameters_are_of_the_gaussians_dtype(name):
     assert {leaf.dtype for leaf in jax.tree.leaves(floats)} <= {gaussians.means.dtype}
 
 
+def num_floats(template, num):
+    """Trained floats of an appearance besides those of its Gaussians."""
+    gaussians, appearance = allocated(template)
+    return (Model(gaussians, appearance).bytes_of(num) - Model(gaussians).bytes_of(num)) / 4
+
+
 def test_floats_of_a_splat():
-    floats = {name: count_floats(allocated(template)[1], 10) for name, template in APPEARANCES.items()}
+    floats = {name: num_floats(template, 10) for name, template in APPEARANCES.items()}
     assert floats == {"plain": 0, "textured": 240, "movable kernels": 270, "billboards": 990, "shaped": 250}
-    assert count_floats(allocated(Billboards())[1], 1) == 1081 - 58
-    assert MovableKernels().num_published_floats(1) == 74 - 58
+    assert num_floats(billboards(), 1) == 1081 - 58
+    assert movable_kernels().num_published_floats(1) == 74 - 58
 
 
 @pytest.mark.parametrize(
     ("template", "size", "opacity"),
-    [(MovableKernels(), 1.0, 0.6), pytest.param(Billboards(side=15), 0.5, 0.5, marks=pytest.mark.long)],
+    [(movable_kernels(), 1.0, 0.6), pytest.param(billboards(side=15), 0.5, 0.5, marks=pytest.mark.long)],
 )
 def test_appearances_start_colourless_and_as_opaque_as_their_gaussians_or_half(template, size, opacity):
     scene = hand_scene([[0.1, 0.1, 4]], [FACING], [[size, size]], [0.6], [[0.2, 0.5, 0.7]])
@@ -114,7 +122,7 @@ def test_appearances_start_colourless_and_as_opaque_as_their_gaussians_or_half(t
     # The ray of this pixel meets the mean.
     np.testing.assert_allclose(output.alpha[6, 8], opacity, rtol=1e-5)
     np.testing.assert_allclose(output.color[6, 8], opacity * np.array([0.2, 0.5, 0.7]), rtol=1e-5)
-    if isinstance(appearance, Billboards):
+    if hasattr(appearance, "pictures"):
         assert appearance.pictures.buckets[0][0, [0, -1], :, 3].max() < 1 / 255
 
 
@@ -124,9 +132,9 @@ def test_billboards_end_one_texel_beyond_the_border(side):
     scale = 8 / 2 * 4 / FOCAL
     scene = hand_scene([[0, 0, 4]], [FACING], [np.log([scale, 10 * scale])], [0.5], [[1, 1, 1]])
     gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
-    pictures = allocate_appearance(Billboards(side=side), KEY, gaussians).pictures
+    pictures = allocate_appearance(billboards(side=side), KEY, gaussians).pictures
     pictures = dataclasses.replace(pictures, buckets=(pictures.buckets[0].at[..., 3].set(0.8),))
-    alpha = render_appearance(gaussians, camera, Billboards(pictures=pictures, side=side)).alpha[6]
+    alpha = render_appearance(gaussians, camera, billboards(pictures=pictures, side=side)).alpha[6]
     pixels_beyond = np.maximum(abs(np.arange(16) + 0.5 - 8) - 4, 0)
     np.testing.assert_allclose(alpha, 0.8 * np.maximum(1 - pixels_beyond * (side - 1) / 8, 0), atol=2e-6)
     assert np.count_nonzero(alpha) == {3: 16, 5: 12}[side]
@@ -157,15 +165,15 @@ def test_only_appearances_are_allocated_and_only_allocated_ones_projected():
 
 
 def test_what_is_trained_is_projected():
-    _, appearance = allocated(MovableKernels())
+    _, appearance = allocated(movable_kernels())
     assert project_appearance(moved(appearance)).sharpness.min() == 0
-    _, appearance = allocated(Billboards())
+    _, appearance = allocated(billboards())
     (bucket,) = project_appearance(moved(appearance)).pictures.buckets
     assert bucket[..., 3].min() == 0 and bucket[..., 3].max() == jnp.float32(0.99) and bucket[..., :3].min() < -3
 
 
 def test_copies_of_a_billboard_show_what_one_did():
-    gaussians, appearance = allocated(Billboards(side=3))
+    gaussians, appearance = allocated(billboards(side=3))
     appearance = project_appearance(moved(appearance))
     num_shares = jnp.arange(40, dtype=jnp.int32) % 4 + 1
     same, shared = appearance.share(gaussians, num_shares)
@@ -177,7 +185,7 @@ def test_copies_of_a_billboard_show_what_one_did():
 
 @pytest.mark.long
 def test_copies_of_movable_kernels_are_those_of_a_gaussian_as_opaque():
-    gaussians, appearance = allocated(MovableKernels())
+    gaussians, appearance = allocated(movable_kernels())
     appearance = moved(appearance)
     num_shares = jnp.arange(40, dtype=jnp.int32) % 4 + 1
     before = appearance.opacities(gaussians)
@@ -220,9 +228,9 @@ class OwnFalloff(Appearance):
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: Billboards(side=1), r"side must be in 2\.\.16; got 1"),
-        (lambda: Billboards(initial_rgb=0.0), "initial_rgb"),
-        (lambda: Billboards(exponents=Exponents()), "exponents replace a Gaussian falloff, and Billboards has another"),
+        (lambda: billboards(side=1), r"side must be in 2\.\.16; got 1"),
+        (lambda: billboards(initial_rgb=0.0), "initial_rgb"),
+        (lambda: billboards(exponents=Exponents()), "exponents replace a Gaussian falloff, and Billboards has another"),
         (lambda: OwnFalloff(exponents=Exponents()), "exponents replace a Gaussian falloff, and OwnFalloff has another"),
     ],
 )
@@ -232,7 +240,7 @@ def test_wrong_options_are_refused(make, words):
 
 
 def test_billboards_of_another_size_are_refused(tmp_path):
-    gaussians, appearance = allocated(Billboards(side=4))
+    gaussians, appearance = allocated(billboards(side=4))
     model = Model(gaussians, appearance.with_textures(allocate_textures(np.full((40, 2), 3))))
     with pytest.raises(ValueError, match=r"pictures must all have 4 × 4 texels; got sizes \(\(3, 3\),\)$"):
         save_model(tmp_path / "model.npz", model)
@@ -253,11 +261,11 @@ CAPABILITIES = [
     (TEXTURED, (True, True, TextureOptions(), True)),
     (Appearance(texture=OFFICIAL), (True, False, TextureOptions.official(), True)),
     (Own(texture=Texture()), (False, False, TextureOptions(), True)),
-    (MovableKernels(), (False, False, None, False)),
-    (Billboards(), (False, False, None, False)),
+    (movable_kernels(), (False, False, None, False)),
+    (billboards(), (False, False, None, False)),
     (Appearance(exponents=Exponents()), (True, True, None, True)),
     (Appearance(texture=OFFICIAL, exponents=Exponents()), (True, False, TextureOptions.official(), True)),
-    (MovableKernels(exponents=Exponents()), (False, False, None, False)),
+    (movable_kernels(exponents=Exponents()), (False, False, None, False)),
 ]
 """is_portable, is_linear, texture_options, has_own_opacities."""
 
@@ -275,5 +283,5 @@ def test_portable_appearances_come_from_their_options_and_have_words():
     assert appearance_for(options, has_textures=True, has_degrees=True, has_shapes=True) == whole
     assert appearance_for(options, has_textures=False) == Appearance(max_alpha=options.max_alpha)
     assert in_words(whole) == "Gaussians with texture, exponents and bands"
-    assert in_words(Appearance()) == "plain Gaussians" and in_words(MovableKernels()) == "MovableKernels"
-    assert in_words(MovableKernels(exponents=Exponents())) == "MovableKernels with exponents"
+    assert in_words(Appearance()) == "plain Gaussians" and in_words(movable_kernels()) == "MovableKernels"
+    assert in_words(movable_kernels(exponents=Exponents())) == "MovableKernels with exponents"

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from run_folders import create_run
 from scipy import integrate
+from small_models import with_bands
 from small_values import some_gaussians
 
 from a2tg_jax import (
     A2tg,
     Appearance,
-    Bands,
     Camera,
     Exponents,
     Gaussians,
@@ -29,22 +29,10 @@ from a2tg_jax import (
     save_splats,
     textures_from_arrays,
 )
-from a2tg_jax.appearance.parts import bands_of_dense, curves_of, falloff_of, nearest_gaussians, shapes_of
 from a2tg_jax.cli.main import main
-from a2tg_jax.core.origin import WHITE
 from a2tg_jax.data.load import SceneSource
 from a2tg_jax.finish import baking
-from a2tg_jax.finish.baking import (
-    as_plain,
-    bake,
-    distill,
-    drawn_scene,
-    kernels,
-    likeness,
-    pictures,
-    shares_inside,
-    split_splats,
-)
+from a2tg_jax.finish.baking import bake, kernels, shares_inside
 from a2tg_jax.finish.shrinking import fewest_texels
 from a2tg_jax.results import conversion
 from a2tg_jax.results.record import RunRecord, write_record
@@ -70,8 +58,7 @@ def textured(num: int = 3, side: int = 4, seed: int = 0) -> Model:
 def banded(inner: Model) -> Model:
     """The same model with one splat of degree 3 and the others of degree 0."""
     degrees = 3 * (np.arange(inner.num) == 0)
-    bands = Bands(bands_of_dense(np.ones((inner.num, 15, 3), np.float32), degrees, 0))
-    return dataclasses.replace(inner, appearance=dataclasses.replace(inner.appearance, bands=bands))
+    return with_bands(inner, np.ones((inner.num, 15, 3), np.float32), degrees)
 
 
 def shaped(inner: Model) -> Model:
@@ -81,8 +68,23 @@ def shaped(inner: Model) -> Model:
 
 
 def psnr(model: Model, other: Model) -> float:
-    (found,), (wanted,) = pictures(model, [CAMERA]), pictures(other, [CAMERA])
+    found, wanted = (np.clip(each.render(CAMERA).color, 0, 1) for each in (model, other))
     return float(-10 * np.log10(np.mean((found - wanted) ** 2)))
+
+
+def without_textures(model: Model) -> Model:
+    return dataclasses.replace(model, appearance=Appearance())
+
+
+def split_splats(model: Model, growth: float = 2.0) -> Model:
+    return bake(model, [CAMERA], growth=growth, iterations=0)
+
+
+def kernel_at(log_exponent: float, rho: np.ndarray) -> np.ndarray:
+    """exp(−((ρ + ε)^β − ε^β) / ((2 + ε)^β − ε^β)) for ε = 0.02: 1 at the centre, 1/e at √2 standard deviations."""
+    beta, epsilon = np.exp(log_exponent), 0.02
+    start = epsilon**beta
+    return np.exp(-((rho + epsilon) ** beta - start) / ((2 + epsilon) ** beta - start))
 
 
 CONVENTIONS = [TextureOptions(), TextureOptions("align-corners")]
@@ -130,19 +132,15 @@ def test_textures_of_another_extent_become_splats_where_they_are_shown(outside):
     model, options = textured(), TextureOptions(outside=outside, extent=1.5)
     texture = dataclasses.replace(model.appearance.texture, options=options)
     model = dataclasses.replace(model, appearance=dataclasses.replace(model.appearance, texture=texture))
-    found = split_splats(model, [CAMERA], 2.0)
-    assert psnr(found, model) > psnr(as_plain(model.gaussians, model), model) + 2
+    found = split_splats(model)
+    assert psnr(found, model) > psnr(without_textures(model), model) + 2
 
 
-@pytest.fixture(scope="module")
-def split() -> Model:
-    return split_splats(textured(), [CAMERA], 2.0)
-
-
-def test_a_splat_per_texel_looks_like_the_texture(split):
+def test_a_splat_per_texel_looks_like_the_texture():
     model = textured()
+    split = split_splats(model)
     assert split.num > 3 * model.num and split.num_bytes <= 2 * model.num_bytes
-    assert psnr(split, model) > psnr(as_plain(model.gaussians, model), model) + 5
+    assert psnr(split, model) > psnr(without_textures(model), model) + 5
 
 
 @pytest.mark.parametrize("shape", [-0.8, 0.3])
@@ -154,17 +152,18 @@ def test_small_splats_are_as_opaque_as_the_kernel_at_their_centres(shape):
     mixed = np.exp(-0.5 * ((means[:, None] - means[None]) / scales[None]) ** 2)
     depths = mixed @ -np.log1p(-np.asarray(found.opacities, np.float64)).reshape(4, 4) @ mixed.T
     rho = means[:, None] ** 2 + means[None] ** 2
-    kernel = falloff_of(curves_of(jnp.asarray([[shape]])), jnp.asarray(rho))
+    kernel = kernel_at(np.tanh(shape), rho)
     np.testing.assert_allclose(1 - np.exp(-depths), parent.opacities[0] * kernel, atol=3e-3)
 
 
 @pytest.mark.parametrize("log_exponent", [-1.0, 0.0, 0.4])
 def test_the_nearest_gaussian_has_the_least_squared_difference(log_exponent):
-    gaussians, shapes = dataclasses.replace(some_gaussians(1), logit_opacities=jnp.zeros(1)), shapes_of([log_exponent])
-    found = nearest_gaussians(gaussians, shapes)
+    gaussians = dataclasses.replace(some_gaussians(1), logit_opacities=jnp.zeros(1))
+    shapes = jnp.arctanh(jnp.clip(jnp.asarray([log_exponent]), -1 + 1e-7, 1))
+    found = split_splats(Model(gaussians, Appearance(exponents=Exponents(shapes)))).gaussians
     peak, factor = 2 * float(found.opacities[0]), float(jnp.exp(found.log_scales - gaussians.log_scales)[0, 0])
     rho = np.linspace(0, 144, 100_001)
-    kernel = np.asarray(falloff_of(curves_of(jnp.asarray(shapes)), jnp.asarray(rho)))
+    kernel = kernel_at(log_exponent, rho)
     difference = lambda a, k: np.mean((a * np.exp(-rho / 2 / k) - kernel) ** 2)  # noqa: E731
     least = difference(peak, factor**2)
     others = [difference(peak * a, factor**2 * k) for a, k in ((0.95, 1), (1.05, 1), (1, 0.9), (1, 1.1), (1.05, 0.95))]
@@ -184,14 +183,13 @@ def test_texels_are_kept_where_pictures_need_them():
     np.testing.assert_allclose(found[0, 0, :, 0], [0.2, 1, 0.2, 1], rtol=1e-5)
 
 
-def test_training_brings_a_plain_model_nearer_over_its_background(split):
+def test_training_brings_a_plain_model_nearer_over_its_background():
     """Cameras in one place, which have no extent, move the means as well."""
-    assert drawn_scene(textured(), [CAMERA], WHITE).scale > 1
-    wanted = dataclasses.replace(textured(), background=WHITE)
-    start = dataclasses.replace(split, background=WHITE)
-    trained = distill(start, wanted, [CAMERA], iterations=30)
-    assert trained.num == split.num and trained.origin == wanted.origin
-    assert (np.asarray(trained.gaussians.means) != np.asarray(split.gaussians.means)).any()
+    wanted = dataclasses.replace(textured(), background=(1.0, 1.0, 1.0))
+    start = split_splats(wanted)
+    trained = bake(wanted, [CAMERA], iterations=30)
+    assert trained.num == start.num and trained.origin == wanted.origin
+    assert (np.asarray(trained.gaussians.means) != np.asarray(start.gaussians.means)).any()
     assert psnr(trained, wanted) > psnr(start, wanted) + 0.5
 
 
@@ -201,9 +199,9 @@ def test_growth_is_kept_where_degrees_differ(monkeypatch):
     monkeypatch.setattr(baking, "texel_weights", lambda model, *_: model.textures)
     inner = textured(30, side=1)
     for model in (banded(inner), banded(Model(inner.gaussians))):
-        baked = split_splats(model, [CAMERA], 1.6)
+        baked = split_splats(model, 1.6)
         assert baked.gaussians.sh_degree == 1 and baked.num_bytes <= 1.6 * model.num_bytes
-        assert split_splats(model, [CAMERA], 9.0).gaussians.sh_degree == 3
+        assert split_splats(model, 9.0).gaussians.sh_degree == 3
 
 
 @pytest.mark.parametrize(("is_test", "counts"), [([False, True, False], (2, 1)), ([True] * 3, (3, 0))])
@@ -214,15 +212,11 @@ def test_held_out_cameras_do_not_train(is_test, counts):
 
 @pytest.mark.long
 def test_plain_files_hold_the_nearest_gaussians(tmp_path):
-    model = shaped(dataclasses.replace(textured(), appearance=Appearance()))
+    model = shaped(without_textures(textured()))
     save_splats(tmp_path / "a.ply", model)
-    found = as_plain(load_splats(tmp_path / "a.ply").gaussians, model)
-    (wanted,) = pictures(model, [CAMERA])
-    near, taken = (likeness(pictures(own, [CAMERA]), [wanted]) for own in (found, as_plain(model.gaussians, model)))
-    assert near > taken + 2
-    np.testing.assert_allclose(
-        split_splats(model, [CAMERA], 2.0).gaussians.log_scales, found.gaussians.log_scales, rtol=1e-6
-    )
+    found = without_textures(dataclasses.replace(model, gaussians=load_splats(tmp_path / "a.ply").gaussians))
+    assert psnr(found, model) > psnr(without_textures(model), model) + 2
+    np.testing.assert_allclose(split_splats(model).gaussians.log_scales, found.gaussians.log_scales, rtol=1e-6)
     save_gltf(tmp_path / "a.glb", model, textures=False)
     np.testing.assert_allclose(load_gltf(tmp_path / "a.glb").gaussians.scales, found.gaussians.scales, rtol=1e-5)
 

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.scipy.special import logit
 from small_models import some_now
 
 import a2tg_jax as a2tg
@@ -27,11 +28,11 @@ from a2tg_jax import (
     partition,
 )
 from a2tg_jax.cli import main as cli
-from a2tg_jax.core.budget import bytes_per_gaussian, megabytes_of, number_to_reach
+from a2tg_jax.core.budget import bytes_per_gaussian, number_to_reach
 from a2tg_jax.core.config_json import changed_config, config_from_dict, config_to_dict
-from a2tg_jax.core.gaussians import logit
+from a2tg_jax.training import SYSTEMS
 from a2tg_jax.training.fitting import warn_of_budget
-from a2tg_jax.training.registry import SYSTEMS, system_from_dict, system_to_dict
+from a2tg_jax.training.registry import system_from_dict, system_to_dict
 from a2tg_jax.training.start import check_start
 
 SHORT = {"stage1_iterations": 60, "initial_gaussians": None}
@@ -70,14 +71,14 @@ def filling(system: a2tg.System) -> FillingMcmc | FillingDensity:
     ],
 )  # fmt: skip
 def test_how_a_budget_is_written(text, megabytes):
-    assert megabytes_of(text) == megabytes
-    assert megabytes_of(megabytes) == megabytes
+    assert a2tg.A2tg(memory_budget=text).memory_budget == megabytes
+    assert a2tg.A2tg(memory_budget=megabytes).memory_budget == megabytes
 
 
 def test_what_is_no_budget_is_named():
     for text in ("", "much", "1.5TiB", "1,5MB", "MB", "1.2.3MB", "-1MB", -1.0, True, "nan"):
         with pytest.raises(ValueError, match=r"memory_budget must be a number of MB .* 1.5MB, 800kB or 2GB; got"):
-            megabytes_of(text)
+            a2tg.A2tg(memory_budget=text)
     for text in ("0", 0.0, "0kB", "1e999"):
         with pytest.raises(ValueError, match="memory_budget must be positive and finite; got"):
             a2tg.A2tg(memory_budget=text)

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes_random import quick_then_long
-from small_values import some_gaussians
+from small_models import billboards
+from small_values import SH_C0, some_gaussians
 
 import a2tg_jax as a2tg
 from a2tg_jax import (
@@ -22,9 +23,7 @@ from a2tg_jax import (
     partition,
     project_appearance,
 )
-from a2tg_jax.appearance import Billboards
 from a2tg_jax.appearance.parts import LARGEST_LOG_EXPONENT
-from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.core.numerics import at_least, within
 from a2tg_jax.training.start import start_colors
 
@@ -144,7 +143,7 @@ def test_texels_on_their_bounds_can_leave_them_and_projection_keeps_the_image(op
 def test_alphas_at_their_cap_can_fade():
     """Texels of pictures, whose alpha takes the place of opacity and Gaussian, are projected onto the cap."""
     gaussians = one_splat()
-    floats, places = partition(allocate_appearance(Billboards(), jax.random.key(0), gaussians))
+    floats, places = partition(allocate_appearance(billboards(), jax.random.key(0), gaussians))
     floats, _ = partition(project_appearance(combine(jax.tree.map(lambda x: jnp.full_like(x, 5.0), floats), places)))
     assert floats.pictures.buckets[0][..., 3].max() == jnp.float32(0.99)
 

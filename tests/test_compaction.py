@@ -5,6 +5,8 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_files import compact_bytes
+from small_models import origin_of
 from small_values import some_gaussians
 
 from a2tg_jax import (
@@ -25,9 +27,7 @@ from a2tg_jax.base.text import in_bytes
 from a2tg_jax.cli import main as cli
 from a2tg_jax.finish import compaction
 from a2tg_jax.finish.compaction import best_within, try_choices
-from a2tg_jax.io.compact import encode_model
 from a2tg_jax.results import compression
-from a2tg_jax.scene import origin_of_scene
 
 SCENE = synthetic_scene(num_views=6, width=24, height=18, num_points=300)
 SMALL = {"means": (4, 8, 16), "opacities": (2, 10), "sh_0": (3, 8), "sh_rest": (3, 8), "texels": (3, 8)}
@@ -40,7 +40,7 @@ def a_model() -> Model:
     gaussians = init_from_points(SCENE.points, SCENE.colors, opacity=0.8, sh_degree=0)
     rng = np.random.default_rng(0)
     logits = jnp.asarray(rng.normal(size=gaussians.num) + 1, jnp.float32)
-    return Model(dataclasses.replace(gaussians, logit_opacities=logits), origin=origin_of_scene(SCENE))
+    return Model(dataclasses.replace(gaussians, logit_opacities=logits), origin=origin_of(SCENE))
 
 
 def test_losses_are_differences_of_psnr_and_of_renders():
@@ -67,7 +67,7 @@ def test_the_smallest_file_loses_no_more_than_it_may():
     assert [(trial.group, trial.precision) for trial in trials] == [
         ("means", 4), ("means", 8), ("means", 16), ("opacities", 2), ("opacities", 10), ("sh_0", 3), ("sh_0", 8),
     ]  # fmt: skip
-    assert all(trial.num_bytes == len(encode_model(model, trial.choices)) for trial in trials)
+    assert all(trial.num_bytes == len(compact_bytes(model, trial.choices)) for trial in trials)
     assert trials[0].num_bytes < trials[2].num_bytes and trials[0].losses[0] > trials[2].losses[0]
     found = [smallest_within(model, [loss], most, trials) for most in (0.02, 0.2, 5.0)]
     assert all(trial.losses[0] <= most for trial, most in zip(found, (0.02, 0.2, 5.0), strict=True))

@@ -7,6 +7,8 @@ import shutil
 import numpy as np
 import pytest
 from run_folders import create_run
+from small_files import grids_of, half_turned
+from small_models import origin_of
 from test_cli import fails
 
 from a2tg_jax import (
@@ -26,11 +28,9 @@ from a2tg_jax import (
 from a2tg_jax.cli import main as cli
 from a2tg_jax.data.load import SceneSource
 from a2tg_jax.finish import tuning
-from a2tg_jax.io.compact import grids_of, half_turned
 from a2tg_jax.results import compression
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.record import RunRecord, read_record, write_record
-from a2tg_jax.scene import origin_of_scene
 from a2tg_jax.training import reports
 from a2tg_jax.training.start import initial_model
 
@@ -48,7 +48,7 @@ def run(tmp_path_factory):
     system = A2tg(stage1_iterations=1, stage2_iterations=1, initial_gaussians=60, densify=Mcmc(cap=60))
     write_record(run, RunRecord(SceneSource("synthetic", downscale=5), "a2tg", system))
     scene = read_record(run).scene.load()
-    model = dataclasses.replace(initial_model(scene, system), origin=origin_of_scene(scene))
+    model = dataclasses.replace(initial_model(scene, system), origin=origin_of(scene))
     textures = allocate_textures(np.full((60, 2), 2), rgb=0.1)
     save_model(run.own(run.model("a2tg-gaussians")), model)
     textured = dataclasses.replace(model, appearance=Appearance(texture=Texture(textures)))

@@ -30,7 +30,7 @@ from a2tg_jax import (
 )
 from a2tg_jax.core.cameras import moved_viewmat, rotation_exp
 from a2tg_jax.training import SYSTEMS
-from a2tg_jax.training.corrections import exposed, initial_corrections, updated
+from a2tg_jax.training.corrections import initial_corrections, updated
 
 SYSTEM = Gaussians2dMcmc(
     stage1_iterations=24, stage2_iterations=16, initial_gaussians=80, densify=Mcmc(cap=90), exposure=True,
@@ -88,7 +88,7 @@ def test_no_motion_is_exactly_none():
     viewmat = jnp.asarray(np.random.default_rng(0).normal(size=(4, 4)), jnp.float32)
     np.testing.assert_array_equal(moved_viewmat(jnp.zeros(6), viewmat), viewmat)
     color = jnp.asarray(np.random.default_rng(1).uniform(size=(5, 4, 3)), jnp.float32)
-    np.testing.assert_array_equal(exposed(jnp.eye(3, 4), color), color)
+    np.testing.assert_array_equal(Exposure().color(jnp.eye(3, 4), color), color)
 
 
 def test_a_turned_camera_stays_where_it_is(scene):

@@ -13,6 +13,7 @@ import oracle_appearances
 import pytest
 from oracle import DEFAULT_RULES
 from scenes_random import as_camera, as_gaussians, draw_scene, draw_smooth_scene
+from small_models import billboards, movable_kernels
 from test_oracle import EDGE_ON, hand_scene
 from test_render import errors
 from test_render_gradients import CLEARANCE, assert_gradients_close, differences, draw_weights
@@ -28,8 +29,6 @@ from a2tg_jax import (
     shared,
     static,
 )
-from a2tg_jax.appearance import Billboards, MovableKernels
-from a2tg_jax.core.numerics import normalize
 from a2tg_jax.rasterize.views import render_traced
 
 SIDE = 4
@@ -46,8 +45,9 @@ class Glossy(Appearance):
     has_low_pass: bool = static(default=True)
 
     def numbers(self, gaussians, camera):
-        direction = normalize(gaussians.means - camera.center[None])
-        lobe = jnp.exp(3 * (jnp.sum(direction * normalize(self.axes), axis=1) - 1))
+        toward = gaussians.means - camera.center[None]
+        lengths = jnp.linalg.norm(toward, axis=1) * jnp.linalg.norm(self.axes, axis=1)
+        lobe = jnp.exp(3 * (jnp.sum(toward * self.axes, axis=1) / lengths - 1))
         return jnp.concatenate([self.colors * lobe[:, None], jnp.exp(self.log_exponents)[:, None]], axis=1)
 
     def shade(self, numbers, values, u, v):
@@ -116,19 +116,19 @@ def painted(arrays: dict) -> Painted:
     return Painted(**jax.tree.map(jnp.asarray, arrays))
 
 
-def movable_kernels(arrays: dict) -> MovableKernels:
-    return MovableKernels(**jax.tree.map(jnp.asarray, arrays))
+def movable(arrays: dict) -> Appearance:
+    return movable_kernels(**jax.tree.map(jnp.asarray, arrays))
 
 
 def shaped(arrays: dict) -> Appearance:
     return Appearance(exponents=Exponents(jnp.asarray(arrays["shapes"])))
 
 
-def billboards(arrays: dict) -> Billboards:
+def pictured(arrays: dict) -> Appearance:
     texels = jnp.asarray(arrays["texels"])
     empty = allocate_textures(np.full((len(texels), 2), SIDE), dtype=texels.dtype)
     filled = empty.buckets[0].at[: len(texels)].set(texels)
-    return Billboards(pictures=dataclasses.replace(empty, buckets=(filled,)), side=SIDE)
+    return billboards(pictures=dataclasses.replace(empty, buckets=(filled,)), side=SIDE)
 
 
 class Case(NamedTuple):
@@ -152,8 +152,8 @@ CASES = {
     ),
     "painted": Case("painted", painted, True, 53),
     "shaped": Case("shaped", shaped, True, 53),
-    "movable kernels": Case("movable", movable_kernels, False, 1),
-    "billboards": Case("billboard", billboards, False, 0),
+    "movable kernels": Case("movable", movable, False, 1),
+    "billboards": Case("billboard", pictured, False, 0),
 }
 FAST = ("movable kernels", "painted")
 """The cases whose gradients the default tests compare."""
@@ -286,7 +286,7 @@ def test_the_statistic_takes_the_way_of_the_falloff(compositor):
     by_mean, statistic = differentiate(gaussians, probe, glossy(arrays))
     assert jnp.max(jnp.abs(by_mean.means)) > 1e-2
     np.testing.assert_allclose(statistic[:, :3], jnp.abs(by_mean.means), atol=1e-12)
-    _, statistic = differentiate(gaussians, probe, billboards(random_arrays("billboard", len(scene.means))))
+    _, statistic = differentiate(gaussians, probe, pictured(random_arrays("billboard", len(scene.means))))
     np.testing.assert_array_equal(statistic[:, :3], 0)
 
 

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
+from small_values import centers_of
 
 import a2tg_jax as a2tg
 from a2tg_jax import Similarity, load_scene
 from a2tg_jax.core.camera_paths import outlying_cameras, turntable
-from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.data.assembly import normalizing_similarity
 from a2tg_jax.mesh.extract import common_sphere
 
@@ -62,7 +62,7 @@ def test_normalised_world(seed):
     np.testing.assert_allclose(similarity.apply(elsewhere.apply(target)), np.zeros(3), atol=1e-9)
     up = -moved[:, 1, :3].mean(axis=0)
     np.testing.assert_allclose(up / np.linalg.norm(up), [0, 0, 1], atol=1e-12)
-    assert np.median(np.linalg.norm(camera_centers(moved), axis=1)) == pytest.approx(1)
+    assert np.median(np.linalg.norm(centers_of(moved), axis=1)) == pytest.approx(1)
 
 
 def test_parallel_axes_fall_back_to_the_mean_camera():

@@ -24,6 +24,7 @@ from a2tg_jax import (
     load_checkpoint,
     pytree,
     save_checkpoint,
+    stop_on_signals,
     synthetic_scene,
 )
 from a2tg_jax.training import step
@@ -132,8 +133,8 @@ def test_each_restoration_has_another_order(scene):
 def test_ctrl_c_in_the_last_step_interrupts_too(scene):
     system, kept = Gaussians2dMcmc(stage1_iterations=10, **SIZES), []
     press = lambda row: signal.raise_signal(signal.SIGINT)  # noqa: E731
-    with pytest.raises(Interrupted, match="after iteration 10 of stage 1") as stopped:
-        fit(scene, system, on_log=press, on_checkpoint=kept.append, progress=False)
+    with pytest.raises(Interrupted, match="after iteration 10 of stage 1") as stopped, stop_on_signals() as is_stopped:
+        fit(scene, system, on_log=press, on_checkpoint=kept.append, is_stopped=is_stopped)
     assert [checkpoint.iteration for checkpoint in kept] == [10]
     resumed = fit(scene, system, resume=stopped.value.checkpoint, progress=False)
     jax.tree.map(np.testing.assert_array_equal, resumed.model.gaussians, stopped.value.checkpoint.model.gaussians)

@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_models import origin_of
 from test_notebooks import internal_names
 
 import a2tg_jax as a2tg
-from a2tg_jax.scene import origin_of_scene
 
 DOCS = Path(__file__).parent.parent / "docs"
 REAL_FIT = inspect.signature(a2tg.fit)
@@ -43,7 +43,7 @@ def untrained(*args, **kwargs):
     gaussians = a2tg.init_from_points(scene.points, scene.colors, num=50, sh_degree=0)
     appearance = system.stages()[-1].appearance
     appearance = a2tg.allocate_appearance(appearance, jax.random.key(0), gaussians)
-    model = a2tg.Model(gaussians, appearance, origin=origin_of_scene(scene))
+    model = a2tg.Model(gaussians, appearance, origin=origin_of(scene))
 
     def more(scene, iterations):
         return untrained(scene, dataclasses.replace(system, more=(*system.more, iterations)))

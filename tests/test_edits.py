@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from small_values import some_gaussians
+from small_files import model_in, taken_apart
+from small_values import centers_of, some_gaussians
 from test_upright import captured, node_matrix
 from viewer_cases import small_model
 
@@ -16,9 +17,7 @@ from a2tg_jax import Similarity
 from a2tg_jax.cli.main import main
 from a2tg_jax.core.camera_paths import turntable
 from a2tg_jax.core.floaters import floater_scores
-from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.io.columns import decode
-from a2tg_jax.io.compact import decode_model, unframed
 from a2tg_jax.io.edit_file import largest_score, scores_of
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.results.editing import EditOptions
@@ -59,7 +58,7 @@ def test_floaters_are_what_floats_not_what_is_faint():
     model, rng = captured(NOWHERE), np.random.default_rng(0)
     floor = np.concatenate([rng.uniform(-1, 1, (400, 2)), rng.normal(0, 0.01, (400, 1))], axis=1)
     wall = np.concatenate([rng.uniform(-6, 6, (60, 2)), rng.normal(-3, 0.1, (60, 1))], axis=1)
-    centers = camera_centers(model.origin.viewmats)
+    centers = centers_of(model.origin.viewmats)
     needles = np.repeat(centers, 2, axis=0)[:20] * rng.uniform(0.6, 0.85, (20, 1)) + rng.normal(0, 0.1, (20, 3))
     means = np.concatenate([floor, wall, needles])
     log_scales = np.repeat(np.log([0.05, 1.0, 0.02]), [400, 60, 20])[:, None] * np.ones(2)
@@ -88,7 +87,7 @@ def test_scores_of_few_or_equal_gaussians():
 
 def test_the_viewers_file_has_the_same_scores_and_the_vertical():
     model = a2tg.apply_edit(small_model(), a2tg.Edit(up=np.array([0.0, 0.6, 0.8])))
-    header, body = unframed(data := encode_web_scene(model))
+    header, body = taken_apart(data := encode_web_scene(model))
     scores, start = [], 0
     for name, coder, length in header["parts"]:
         if name == "floaters":
@@ -97,7 +96,7 @@ def test_the_viewers_file_has_the_same_scores_and_the_vertical():
         start += length
     np.testing.assert_array_equal(np.sort(np.concatenate(scores)), np.sort(scores_of(model)))
     assert header["origin"]["up"] == [0.0, 0.6, 0.8]
-    assert decode_model(data).origin == model.origin
+    assert model_in(data).origin == model.origin
 
 
 def test_a_chosen_vertical_turns_files_and_orbits_but_no_number(tmp_path):
@@ -128,7 +127,7 @@ def test_commands_take_an_edit(tmp_path, capsys):
     assert main(["convert", str(tmp_path / "m.npz"), str(tmp_path / "n.ply"), "--edit", str(path)]) == 0
     assert main(["export", str(tmp_path / "m.npz"), "--web", str(tmp_path / "site"), "--edit", str(path)]) == 0
     assert "the original one turned by" in capsys.readouterr().out
-    page = decode_model((tmp_path / "site" / "scene.a2tgz").read_bytes())
+    page = model_in((tmp_path / "site" / "scene.a2tgz").read_bytes())
     assert a2tg.load_ply(tmp_path / "n.ply").num == page.num == edited.num
     assert page.origin == edited.origin
     assert main([*words[:2], str(tmp_path / "o.npz"), "--edit", str(tmp_path / "none.json")]) == 2

@@ -18,7 +18,6 @@ from a2tg_jax import adam_init, combine, partition
 from a2tg_jax.training.cost import forecast_stages
 from a2tg_jax.training.reports import StageEffects
 from a2tg_jax.training.step import initial_state, jitted_step
-from a2tg_jax.training.terms import l1
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +73,7 @@ class Own(a2tg.System):
     appearance_rate: Any = None
 
     def stages(self):
-        losses = (a2tg.Term(l1),)
+        losses = a2tg.LossConfig(ssim_weight=0.0).terms()
         rates = self.rates, self.iterations, self.appearance_rate
         return (a2tg.Stage("own", self.appearance, self.events, losses, *rates),)
 

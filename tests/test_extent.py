@@ -7,15 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from run_folders import RECORD, create_run
-from small_models import some_checkpoint, some_model
+from small_files import put_together, read_archive, taken_apart, write_archive
+from small_models import assert_same_rule, some_checkpoint, some_model
 
 import a2tg_jax as a2tg
-from a2tg_jax.appearance import template_of
-from a2tg_jax.base.archive import FORMAT, read_archive, write_archive
 from a2tg_jax.cli.main import main
-from a2tg_jax.io.compact import decode_model, framed, unframed
 from a2tg_jax.io.web_scene import encode_web_scene
-from a2tg_jax.model_file import FORMAT as MODEL_FORMAT
 from a2tg_jax.results.record import read_record, write_record
 
 NARROW = a2tg.TextureOptions(outside="identity", extent=1.5)
@@ -45,7 +42,7 @@ def appearance_in(path: Path) -> a2tg.Appearance:
         checkpoint = a2tg.load_checkpoint(path)
         assert checkpoint.system.lookup == checkpoint.state.model.appearance.texture_options
         return checkpoint.state.model.appearance
-    return (decode_model(path.read_bytes()) if path.name == "web.a2tgz" else a2tg.load_splats(path)).appearance
+    return a2tg.load_splats(path).appearance
 
 
 def put(node: object, extent: object) -> int:
@@ -63,14 +60,13 @@ def put(node: object, extent: object) -> int:
 
 def rewrite(path: Path, extent: object) -> None:
     if path.suffix == ".npz":
-        kind = FORMAT if path.name == "checkpoint.npz" else MODEL_FORMAT
-        header, arrays = read_archive(path, format=kind)
+        header, arrays = read_archive(path)
         assert put(header, extent)
-        write_archive(path, header, arrays, format=kind)
+        write_archive(path, header, arrays)
     elif path.suffix == ".a2tgz":
-        header, body = unframed(path.read_bytes())
+        header, body = taken_apart(path.read_bytes())
         assert put(header, extent)
-        path.write_bytes(framed(header, body))
+        path.write_bytes(put_together(header, body))
     else:
         described = json.loads(path.read_text())
         assert put(described, extent) == 2, "the extension and the extras"
@@ -128,4 +124,4 @@ def test_rows_a_transform_and_an_edit_keep_it():
     moved = model.transform(a2tg.Similarity(2.0, np.eye(3), np.ones(3)))
     edited = a2tg.apply_edit(model, a2tg.Edit(floaters=0.5))
     for changed in (model[:5], moved, edited):
-        assert template_of(changed.appearance) == template_of(model.appearance)
+        assert_same_rule(changed, model)

@@ -31,11 +31,11 @@ from a2tg_jax.results.forecast import (
 )
 from a2tg_jax.results.plan import plan_run
 from a2tg_jax.results.record import RunRecord, SceneSource
-from a2tg_jax.training import SYSTEMS, fitting, reports
+from a2tg_jax.training import SYSTEMS, fitting
 from a2tg_jax.training.corrections import sliced
 from a2tg_jax.training.cost import Bytes, check_rows_fit, forecast_stages, stage_bytes
 from a2tg_jax.training.loop import StageRun
-from a2tg_jax.training.reports import Pace, Progress, RestOfRun
+from a2tg_jax.training.reports import Pace, RestOfRun
 from a2tg_jax.training.start import initial_model
 from a2tg_jax.training.step import jitted_step
 
@@ -455,20 +455,12 @@ def test_a_run_is_forecast_with_its_later_stages_and_its_evaluation():
     assert after[first].iterations > 2 * views + plan[last].stage.iterations / 2 and after[first].programs > 2
 
 
-def stage_of(iterations):
-    return a2tg.Stage("a-stage", a2tg.Appearance(), (), (), a2tg.LearningRates(), iterations)
-
-
-@pytest.mark.parametrize("is_shown", [True, False])
-def test_the_pace_is_above_the_bar(capsys, monkeypatch, is_shown):
-    monkeypatch.setattr(reports, "TIMED_SECONDS", 0.0)
-    with reports.ProgressBar(Progress(is_shown), stage_of(100), 0) as bar:
-        for done in (10, 20, 30):
-            bar.tell_pace(done, 1)
+def test_the_pace_is_above_the_bar(capsys):
+    with a2tg.ProgressBar("a-stage", 0, 100) as bar:
+        bar.tell("50 ms an iteration, about 0:00:47 left")
     captured = capsys.readouterr()
     assert "\r" not in captured.err
-    found = re.findall(r"a-stage: \S+ ms an iteration, about \S+ left", captured.out)
-    assert len(found) == is_shown
+    assert captured.out == "a-stage: 50 ms an iteration, about 0:00:47 left\n"
 
 
 def test_items_without_a_terminal_are_counted_in_plain_lines(capsys, monkeypatch):
@@ -486,10 +478,9 @@ def test_items_without_a_terminal_are_counted_in_plain_lines(capsys, monkeypatch
 
 def test_without_a_terminal_tenths_are_plain_lines(capsys, monkeypatch):
     monkeypatch.setattr(progress_bars, "PLAIN_SECONDS", 0.0)
-    info = SimpleNamespace(loss=0.5, psnr=20.0)
-    with reports.ProgressBar(Progress(), stage_of(20), 0) as bar:
+    with a2tg.ProgressBar("a-stage", 0, 20) as bar:
         for _ in range(20):
-            bar.update(info, None)
+            bar.update(0.5, 20.0, None, None)
     lines = capsys.readouterr().err.splitlines()
     assert lines[:2] == ["a-stage: compiling", "a-stage: 2 of 20, loss 0.5000, 20.00 dB"] and len(lines) == 11
 
@@ -507,10 +498,9 @@ def test_in_a_notebook_a_bar_is_one_output(capsys, monkeypatch):
     stream = type("OutStream", (io.StringIO,), {"__module__": "ipykernel.iostream"})()
     monkeypatch.setattr(sys, "stderr", stream)
     assert list(progress_bars.progress_over([1, 2, 3], "frames", "frame")) == [1, 2, 3]
-    info = SimpleNamespace(loss=0.5, psnr=20.0)
-    with reports.ProgressBar(Progress(), stage_of(20), 0) as bar:
+    with a2tg.ProgressBar("a-stage", 0, 20) as bar:
         for _ in range(20):
-            bar.update(info, None)
+            bar.update(0.5, 20.0, None, None)
     frames, stage = outputs
     assert "| 0/3 " in frames[0] and "| 3/3 " in frames[-1]
     assert "a-stage (compiling)" in stage[0] and "a-stage: 100%" in stage[-1] and "| 20/20 " in stage[-1]

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from run_folders import create_run
+from small_files import write_archive
+from small_models import assert_same_rule, movable_kernels
 from small_values import some_gaussians
 
 from a2tg_jax import (
@@ -33,8 +35,6 @@ from a2tg_jax import (
     synthetic_scene,
     transform_gaussians,
 )
-from a2tg_jax.appearance import MovableKernels, template_of
-from a2tg_jax.base.archive import write_archive
 from a2tg_jax.cli.main import main
 from a2tg_jax.io.formats import FORMATS, file_bytes, files_of, format_of, lost_by, unseen_elsewhere
 from a2tg_jax.model_file import number_in_file
@@ -174,7 +174,7 @@ def test_what_a_format_does_not_keep():
     assert unseen_elsewhere(shaped, "a.a2tgz") == unseen_elsewhere(Model(some_gaussians()), "a.glb") == ""
     kernels = showing(Appearance(exponents=Exponents()))
     assert lost_by(kernels, "a.usda")[0] == "shapes of kernels (bake turns them into plain splats)"
-    found = lost_by(showing(MovableKernels(exponents=Exponents())), "a.ply")
+    found = lost_by(showing(movable_kernels(exponents=Exponents())), "a.ply")
     assert found == [lost_by(kernels, "a.ply")[0], "what MovableKernels shows besides Gaussians"]
     learned = {"exposure": np.zeros((0, 3, 4)), "pose": np.zeros((0, 6))}
     model = Model(some_gaussians(), origin=dataclasses.replace(model.origin, corrections=learned))
@@ -218,7 +218,8 @@ def test_textures_and_origin_pass_through_gltf(tmp_path, capsys, suffix):
     assert f"not shown by other programs: {TEXTURES}\n" in printed
     main(["convert", str(tmp_path / f"b{suffix}"), str(tmp_path / "c.npz")])
     found = load_model(tmp_path / "c.npz")
-    assert found.origin == model.origin and template_of(found.appearance) == template_of(model.appearance)
+    assert found.origin == model.origin
+    assert_same_rule(found, model)
     np.testing.assert_array_equal(found.gaussians.means, model.gaussians.means)
 
 
@@ -311,9 +312,10 @@ def test_a_file_in_place_of_the_first_stage_is_read_once_and_counted(tmp_path, m
 
 
 def test_gaussians_of_a_model_are_counted_by_their_means(tmp_path):
-    write_archive(tmp_path / "a.npz", {}, {"means": np.zeros((40, 3))}, format="a2tg-jax model")
+    header = {"format": "a2tg-jax model", "version": 1}
+    write_archive(tmp_path / "a.npz", header, {"means": np.zeros((40, 3))})
     assert number_in_file(tmp_path / "a.npz") == 40, "nothing else is read"
-    write_archive(tmp_path / "a.npz", {}, {"quats": np.zeros((40, 4))}, format="a2tg-jax model")
+    write_archive(tmp_path / "a.npz", header, {"quats": np.zeros((40, 4))})
     with pytest.raises(ValueError, match="it has no means"):
         number_in_file(tmp_path / "a.npz")
 

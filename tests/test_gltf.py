@@ -11,19 +11,18 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from small_values import some_gaussians, some_world
+from small_models import assert_same_rule, movable_kernels, rule_of
+from small_values import matrix_of, rotations, some_gaussians, some_world
 from test_compact import MODELS, every_model, plain, shaped, textured
 
 import a2tg_jax as a2tg
 from a2tg_jax import Exponents, Model, Origin, Similarity, TextureOptions, allocate_appearance, load_gltf, save_gltf
-from a2tg_jax.appearance import MovableKernels, template_of
-from a2tg_jax.core.gaussians import rotation_matrices
 from a2tg_jax.io import gltf, other_programs
-from a2tg_jax.io.gltf import EXTENSION
 from a2tg_jax.io.gltf_container import Document
-from a2tg_jax.io.other_programs import joined_parts, matrix_of, upright
+from a2tg_jax.io.other_programs import joined_parts, upright
 
 SPLATS = "KHR_gaussian_splatting"
+EXTENSION = "A2TG_splat_textures"
 
 
 def parts_of(path):
@@ -78,7 +77,8 @@ def test_models_come_back(tmp_path, name):
     save_gltf(path, model)
     found = load_gltf(path)
     assert_shows_the_same(found, model)
-    assert template_of(found.appearance) == template_of(model.appearance) and found.origin == model.origin
+    assert_same_rule(found, model)
+    assert found.origin == model.origin
     assert found.num_bytes == model.num_bytes
     for x, y in zip(jax.tree.leaves(found.textures), jax.tree.leaves(model.textures), strict=True):
         np.testing.assert_array_equal(x, y)
@@ -93,7 +93,7 @@ def test_an_upper_limit_of_alpha_beside_textures_comes_back(tmp_path):
     model = dataclasses.replace(model, appearance=dataclasses.replace(model.appearance, max_alpha=0.5))
     save_gltf(tmp_path / "m.glb", model)
     assert extension_of(parts_of(tmp_path / "m.glb")[0])["maxAlpha"] == 0.5
-    assert template_of(load_gltf(tmp_path / "m.glb").appearance) == template_of(model.appearance)
+    assert_same_rule(load_gltf(tmp_path / "m.glb"), model)
 
 
 @pytest.mark.parametrize("options", [TextureOptions(), TextureOptions.official()])
@@ -103,7 +103,7 @@ def test_textures_in_bytes_come_back_within_half_a_step(tmp_path, options):
     model = dataclasses.replace(model, appearance=dataclasses.replace(model.appearance, texture=texture))
     save_gltf(tmp_path / "m.glb", model, texels="uint8")
     found = load_gltf(tmp_path / "m.glb")
-    assert template_of(found.appearance) == template_of(model.appearance)
+    assert_same_rule(found, model)
     values, wanted = found.textures.flat(), model.textures.flat()
     for columns in (slice(0, 3), slice(3, 4)):
         step = np.ptp(wanted[:, columns]) / 254
@@ -129,7 +129,7 @@ def test_programs_that_know_no_textures_see_plain_splats(tmp_path):
 
 def test_what_the_extension_cannot_hold_is_refused_or_left_out(tmp_path):
     gaussians = some_gaussians()
-    template = MovableKernels(exponents=Exponents())
+    template = movable_kernels(exponents=Exponents())
     model = Model(gaussians, allocate_appearance(template, jax.random.key(0), gaussians))
     with pytest.raises(ValueError, match=r"has MovableKernels with .*: a glTF file holds .*textures=False here"):
         save_gltf(tmp_path / "m.glb", model)
@@ -177,8 +177,7 @@ def test_attributes_are_those_of_the_specification(tmp_path):
     np.testing.assert_allclose(opacities[:, 0], model.gaussians.opacities, rtol=1e-5)
     np.testing.assert_allclose(scales[:, :2], model.gaussians.scales, rtol=1e-5)
     np.testing.assert_allclose(scales[:, 2], scales[:, :2].min(axis=1) / 1000, rtol=1e-5)
-    rotations = np.asarray(rotation_matrices(quats[:, [3, 0, 1, 2]]))
-    np.testing.assert_allclose(rotations, rotation_matrices(model.gaussians.quats), atol=1e-5)
+    np.testing.assert_allclose(rotations(quats[:, [3, 0, 1, 2]]), rotations(model.gaussians.quats), atol=1e-5)
     sh, index = np.asarray(model.sh), 0
     for degree in range(4):
         for order in range(2 * degree + 1):
@@ -269,8 +268,8 @@ def test_integers_that_stand_for_fractions(tmp_path):
     np.testing.assert_allclose(found.gaussians.opacities, gaussians.opacities, atol=1 / 255)
     # The axis that the file has at 0 is the thinnest, the first: the second and third become u and v.
     np.testing.assert_allclose(found.gaussians.scales, 2 * scales / 2, atol=2 * 2 / 65535)
-    first = np.asarray(rotation_matrices(quats[:, [3, 0, 1, 2]]))[:, :, 0] * [-1, -1, 1]
-    normals = np.asarray(rotation_matrices(found.gaussians.quats))[:, :, 2]
+    first = rotations(quats[:, [3, 0, 1, 2]])[:, :, 0] * [-1, -1, 1]
+    normals = rotations(found.gaussians.quats)[:, :, 2]
     np.testing.assert_allclose(np.abs(np.sum(normals * (first[:, [0, 2, 1]] * [1, -1, 1]), axis=1)), 1, atol=1e-3)
 
 
@@ -298,7 +297,7 @@ def test_the_extension_counts_more_than_the_extras(tmp_path, saved, changes, is_
     extended(**changes)(described)
     write_parts(tmp_path / "m.glb", described, saved[1])
     appearance = load_gltf(tmp_path / "m.glb").appearance
-    assert (template_of(appearance) == template_of(textured().appearance)) is is_kept
+    assert (rule_of(appearance) == rule_of(textured().appearance)) is is_kept
     options = appearance.texture_options
     assert (options.uv, options.max_alpha) == (changes.get("uv", "texel-centre"), changes.get("maxAlpha", 0.95))
     assert options.extent == changes.get("extent", 3.0)

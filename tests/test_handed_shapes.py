@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from run_folders import create_run
+from small_models import rule_of
 from small_values import some_gaussians
 
 import a2tg_jax as a2tg
 from a2tg_jax import Appearance, Exponents, Texture, allocate_appearance
-from a2tg_jax.appearance import template_of
 from a2tg_jax.appearance.parts import nearest_gaussians
 from a2tg_jax.results.model_source import check_init, write_first_stage
 from a2tg_jax.results.record import RunRecord, SceneSource
@@ -42,7 +42,7 @@ def first_model(file, scene, system, tmp_path) -> a2tg.Model:
     run, planned = create_run(tmp_path / "run"), record.plan.stages[0]
     write_first_stage(run, record, a2tg.load_splats(file), scene)
     found = a2tg.load_model(run.model(planned.name))
-    assert template_of(found.appearance) == planned.stage.appearance
+    assert rule_of(found.appearance) == planned.stage.appearance
     return found
 
 

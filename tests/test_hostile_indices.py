@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes_random import as_camera, as_gaussians, as_textures, assert_all_close, draw_scene, quick_then_long
+from small_models import billboards
 
 import a2tg_jax as a2tg
 from a2tg_jax import Appearance, Texture, TextureRegion
-from a2tg_jax.appearance import Billboards
 from a2tg_jax.rasterize.compositor import composite
 from a2tg_jax.rasterize.kernels.native import composite as native
 from a2tg_jax.rasterize.splats import project_gaussians, settings_of_pass
@@ -121,12 +121,12 @@ def test_pictures_with_rows_out_of_range():
     stray, last = (dataclasses.replace(pictures, row=jnp.full(NUM, row, jnp.int32)) for row in (
         2**30, len(pictures.buckets[0]) - 1))  # fmt: skip
     with pytest.raises(ValueError, match=r"appearance\.pictures\.row must be below the number"):
-        a2tg.Model(GAUSSIANS, Billboards(pictures=stray, side=4)).render(CAMERA)
+        a2tg.Model(GAUSSIANS, billboards(pictures=stray, side=4)).render(CAMERA)
 
     @functools.partial(jax.jit, static_argnums=0)
     def drawn(compositor, pictures):
         settings = a2tg.RenderSettings(compositor=compositor, capacity=4096)
-        return a2tg.Model(GAUSSIANS, Billboards(pictures=pictures, side=4)).render(CAMERA, settings=settings).color
+        return a2tg.Model(GAUSSIANS, billboards(pictures=pictures, side=4)).render(CAMERA, settings=settings).color
 
     np.testing.assert_array_equal(drawn("native", stray), drawn("native", last))
     np.testing.assert_allclose(drawn("native", stray), drawn("xla", stray), atol=1e-5)

@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from small_files import ATTRIBUTES
+from small_models import billboards, movable_kernels
 from small_values import assert_same, some_gaussians, some_world
 
 from a2tg_jax import (
@@ -24,12 +26,11 @@ from a2tg_jax import (
     textures_from_arrays,
     transform_gaussians,
 )
-from a2tg_jax.appearance import Billboards, MovableKernels
 from a2tg_jax.base.archive import read_archive, read_archive_header, write_archive
 from a2tg_jax.core.config_json import config_from_dict, config_to_dict, flatten_config
 from a2tg_jax.core.sh import sh_basis
 from a2tg_jax.core.similarity import sh_rotation
-from a2tg_jax.io.ply import ATTRIBUTES, encode_ply
+from a2tg_jax.io.ply import encode_ply
 
 
 def write_ply(path, names, rows, encoding="binary_little_endian", types=None) -> None:
@@ -512,7 +513,7 @@ def test_an_option_that_is_missing_has_its_default():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("template", [MovableKernels(), Billboards(side=4)])
+@pytest.mark.parametrize("template", [movable_kernels(), billboards(side=4)])
 def test_ply_of_splats_with_opacities_of_their_own(tmp_path, template):
     gaussians = init_from_points(np.eye(3), np.eye(3), opacity=0.2)
     appearance = allocate_appearance(template, jax.random.key(0), gaussians)

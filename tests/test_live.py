@@ -8,12 +8,11 @@ from types import SimpleNamespace
 
 import jax
 import numpy as np
-from small_models import with_row
+from small_files import taken_apart
+from small_models import billboards, with_row
 from test_compact import plain, textured
 
 from a2tg_jax import Gaussians2dMcmc, History, Mcmc, Model, Session, allocate_appearance, fit_stage, synthetic_scene
-from a2tg_jax.appearance import Billboards
-from a2tg_jax.io.compact import unframed
 from a2tg_jax.results.run_training import unseen
 from a2tg_jax.results.viewing import SECONDS, SHARE, LiveView, shown_live
 from a2tg_jax.training.loop import never
@@ -59,7 +58,7 @@ def test_snapshots_and_figures():
     assert live.routes["/scene.a2tgz"].read() is None and status(live)["version"] == 0
     assert live(run, never) == 0
     encoded(live)
-    scene, _ = unframed(live.routes["/scene.a2tgz"].read())
+    scene, _ = taken_apart(live.routes["/scene.a2tgz"].read())
     assert scene["page"]["title"] == "scene" and scene["num"] == run.state.model.num
     found = status(live)
     assert (found["version"], found["stage"], found["iteration"], found["psnr"]) == (
@@ -111,7 +110,7 @@ def test_pause_holds_the_training_until_it_is_resumed_or_stopped():
 
 def test_systems_that_cannot_be_shown_are_reported():
     gaussians = plain(1).gaussians
-    appearance = allocate_appearance(Billboards(), jax.random.key(0), gaussians)
+    appearance = allocate_appearance(billboards(), jax.random.key(0), gaussians)
     run = stage_run()
     run.state.model = Model(gaussians, appearance)
     live = LiveView(SCENE, "scene")

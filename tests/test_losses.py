@@ -1,5 +1,7 @@
 """Losses: SSIM against scikit-image, normals of a depth map against a plane, gradients against differences."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,18 +11,17 @@ from skimage.metrics import structural_similarity
 
 from a2tg_jax import (
     Camera,
+    LossConfig,
     Model,
     init_from_points,
     normal_consistency,
     photometric_loss,
-    ssim as kernel,
     value_and_grad,
 )
 from a2tg_jax.rasterize.kernels import platforms, window_scores
-from a2tg_jax.rasterize.kernels.native import ffi
-from a2tg_jax.rasterize.kernels.window_scores import Score
-from a2tg_jax.training.losses import depth_normals, live_mean, mean_ssim
-from a2tg_jax.training.terms import opacity, scale
+from a2tg_jax.rasterize.kernels.native import ffi, ssim as kernel
+from a2tg_jax.rasterize.kernels.score import Score
+from a2tg_jax.training.losses import depth_normals, mean_ssim
 
 
 def random_pair(height, width, noise, dtype=np.float64, seed=0):
@@ -165,12 +166,13 @@ def test_regularisers_see_live_rows_only():
     rng = np.random.default_rng(0)
     gaussians = init_from_points(rng.normal(size=(8, 3)), rng.uniform(size=(8, 3)))
     model = Model(gaussians, num_live=jnp.int32(5))
+    opacity, scale = LossConfig(opacity_weight=1.0, scale_weight=1.0).terms()[1:]
     np.testing.assert_allclose(opacity(model, None, None), gaussians.opacities[:5].mean(), rtol=1e-6)
     value, gradient = value_and_grad(lambda model: scale(model, None, None))(model)
     np.testing.assert_allclose(value, gaussians.scales[:5].mean(), rtol=1e-6)
     slopes = gradient.gaussians.log_scales
     assert (slopes[:5] > 0).all() and (slopes[5:] == 0).all()
-    assert live_mean(gaussians.opacities, 0) == 0
+    assert opacity(dataclasses.replace(model, num_live=jnp.int32(0)), None, None) == 0
 
 
 @pytest.mark.parametrize("shape", [(11, 18), (40, 51), (90, 333)])

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import surface_quality
+from small_values import centers_of
 
 import a2tg_jax as a2tg
-from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.data.synthetic import exact_points
 from a2tg_jax.io.other_programs import upright
 from a2tg_jax.mesh import extract, triangles
@@ -235,7 +235,7 @@ def test_a_given_centre_and_cameras_of_a_lens(model):
     cameras = [dataclasses.replace(own, rays=jnp.zeros((own.height, own.width, 2))) for own in model.origin.cameras]
     center = np.array([0.5, 0, 0])
     result = a2tg.extract_mesh(model, cameras, resolution=20, center=center, least_faces=1)
-    apart = np.linalg.norm(camera_centers(model.origin.viewmats) - center, axis=1)
+    apart = np.linalg.norm(centers_of(model.origin.viewmats) - center, axis=1)
     assert result.radius == pytest.approx(2 * np.median(apart))
     plain = a2tg.extract_mesh(model, resolution=20, center=center, least_faces=1)
     np.testing.assert_array_equal(result.mesh.vertices, plain.mesh.vertices)

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes_random import as_camera, as_gaussians, draw_scene
+from small_files import read_archive, write_archive
+from small_models import assert_same_rule
 from small_values import assert_same, some_gaussians, some_world
 from test_hostile_models import refused, spoiled, with_array, with_header
 
@@ -33,9 +35,6 @@ from a2tg_jax import (
     textures_from_arrays,
     to_gsplat,
 )
-from a2tg_jax.appearance import template_of
-from a2tg_jax.base.archive import read_archive, read_archive_header, write_archive
-from a2tg_jax.model_file import FORMAT
 
 SIZES = [(1, 1), (4, 2), (1, 4), (2, 2), (4, 2), (1, 1), (3, 5)]
 
@@ -71,7 +70,7 @@ def textured_model() -> Model:
 
 
 def assert_same_model(found: Model, wanted: Model) -> None:
-    assert template_of(found.appearance) == template_of(wanted.appearance)
+    assert_same_rule(found, wanted)
     assert found.background == wanted.background and found.origin == wanted.origin
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
         assert a.dtype == b.dtype
@@ -84,7 +83,7 @@ def assert_same_model(found: Model, wanted: Model) -> None:
 def test_round_trip(tmp_path):
     save_model(tmp_path / "m.npz", textured_model(), {"note": "kept", "format": "of the caller"})
     assert_same_model(load_model(tmp_path / "m.npz"), textured_model())
-    assert read_archive_header(tmp_path / "m.npz", format=FORMAT)["note"] == "kept"
+    assert read_archive(tmp_path / "m.npz")[0]["note"] == "kept"
 
 
 def test_only_rows_that_exist_are_kept(tmp_path):
@@ -112,17 +111,16 @@ def test_models_of_version_0_2(tmp_path):
     shapes = np.linspace(-1, 1, 7).astype(np.float32)
     shaped = dataclasses.replace(wanted.appearance, exponents=Exponents(jnp.asarray(shapes)))
     save_model(tmp_path / "textured.npz", wanted)
-    header, arrays = read_archive(tmp_path / "textured.npz", format=FORMAT)
+    header, arrays = read_archive(tmp_path / "textured.npz")
     header["origin"]["background"] = header.pop("background")
     options = header.pop("appearance")["parts"]["texture"]
     inner = {"module": "a2tg_jax.appearance.textured", "name": "Textured", "options": options}
     outer = {"module": "a2tg_jax.appearance.shaped", "name": "Shaped", "options": {}, "held": {"inner": inner}}
-    kept = {name: value for name, value in header.items() if name not in ("format", "version")}
-    write_archive(tmp_path / "textured.npz", {**kept, "appearance": inner}, arrays, format=FORMAT)
+    write_archive(tmp_path / "textured.npz", {**header, "appearance": inner}, arrays)
     assert_same_model(load_model(tmp_path / "textured.npz"), wanted)
     arrays = {name.replace("appearance/", "appearance/inner."): array for name, array in arrays.items()}
     arrays["appearance/shapes"] = shapes
-    write_archive(tmp_path / "shaped.npz", {**kept, "appearance": outer}, arrays, format=FORMAT)
+    write_archive(tmp_path / "shaped.npz", {**header, "appearance": outer}, arrays)
     assert_same_model(load_model(tmp_path / "shaped.npz"), dataclasses.replace(wanted, appearance=shaped))
 
 
@@ -141,7 +139,7 @@ def test_an_appearance_of_an_imported_module_is_found(tmp_path):
 
 def test_a_file_imports_nothing_and_says_what_to_do(tmp_path):
     save_model(tmp_path / "m.npz", tinted_model())
-    spoiled(tmp_path / "m.npz", FORMAT, lambda header, _: header["appearance"].update(module="antigravity"))
+    spoiled(tmp_path / "m.npz", lambda header, _: header["appearance"].update(module="antigravity"))
     with pytest.raises(ValueError, match=r"m\.npz: .*Tint .*antigravity.*import that module.*appearances=\(Tint,\)"):
         load_model(tmp_path / "m.npz")
     assert_same_model(load_model(tmp_path / "m.npz", appearances=(Tint,)), tinted_model())
@@ -161,14 +159,14 @@ def with_text(text: str):
     """Replaces the header by any text."""
 
     def spoil(path):
-        _, arrays = read_archive(path, format=FORMAT)
+        _, arrays = read_archive(path)
         np.savez(path, header=np.frombuffer(text.encode(), np.uint8), **arrays)
 
     return spoil
 
 
 def head(**values) -> str:
-    return json.dumps({"format": FORMAT, "version": 1, **values})
+    return json.dumps({"format": "a2tg-jax model", "version": 1, **values})
 
 
 @pytest.mark.parametrize(
@@ -222,7 +220,7 @@ def test_files_that_are_damaged_are_one_error_that_names_them(tmp_path, spoil, m
 def test_arrays_and_options_that_do_not_fit_are_refused(tmp_path, change, message):
     path = tmp_path / "bad.npz"
     save_model(path, textured_model())
-    spoiled(path, FORMAT, change)
+    spoiled(path, change)
     refused(load_model, path, message)
 
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes_random import as_gaussians, draw_scene
+from small_models import billboards, movable_kernels, with_bands
 
 from a2tg_jax import (
     Appearance,
@@ -23,9 +24,7 @@ from a2tg_jax import (
     textures_from_arrays,
     value_and_grad,
 )
-from a2tg_jax.appearance import Billboards, MovableKernels
 from a2tg_jax.appearance.base import check_appearance
-from a2tg_jax.appearance.parts import bands_of_dense
 from a2tg_jax.core.table import Table
 from a2tg_jax.events import gather_moments, gather_rows
 
@@ -50,17 +49,18 @@ def some_model(name: str, seed: int = 2, num: int = NUM) -> Model:
         sizes = [SIZES[(index + seed) % 3] for index in range(num + 2)]
         arrays = [rng.uniform(size=(*size, 4)).astype(np.float32) for size in sizes]
         appearance = appearance.with_textures(textures_from_arrays(arrays))
+    model = Model(gaussians, appearance, jnp.int32(num))
     if template.bands is not None:
         dense = rng.normal(size=(num + 2, 15, 3)).astype(np.float32)
-        appearance = appearance.with_coefficients(bands_of_dense(dense, rng.integers(0, 4, num + 2), 0))
-    return Model(gaussians, appearance, jnp.int32(num))
+        model = with_bands(model, dense, rng.integers(0, 4, num + 2))
+    return model
 
 
 APPEARANCES = {
     "plain": Appearance(),
     "texture": Appearance(texture=Texture(start=(2, 3))),
-    "movable kernels": MovableKernels(),
-    "billboards": Billboards(side=3),
+    "movable kernels": movable_kernels(),
+    "billboards": billboards(side=3),
     "bands": Appearance(bands=Bands(), texture=Texture(start=(1, 2))),
     "exponents": Appearance(exponents=Exponents()),
     "all parts": Appearance(bands=Bands(), exponents=Exponents(), texture=Texture(start=(1, 2))),

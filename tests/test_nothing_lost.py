@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import hashlib
 import json
 import os
 import platform
@@ -34,7 +35,6 @@ from a2tg_jax import (
 )
 from a2tg_jax.base.atomic import replacing, write_whole
 from a2tg_jax.base.machine import this_machine
-from a2tg_jax.base.regular_files import sha256_of
 from a2tg_jax.cli import main as cli, runs
 from a2tg_jax.host import signals
 from a2tg_jax.host.errors import error_text
@@ -368,7 +368,7 @@ def test_lpips_is_kept_while_the_models_are_the_same(scene, stopped, tmp_path, m
     train_run(run, scene, QUIET)
     run_evaluation.evaluate_run(run, scene)
     metrics, per_view = (json.loads(path.read_text()) for path in (run.metrics, run.per_view))
-    assert metrics["models"][NAME]["sha256"] == sha256_of(run.model(NAME))
+    assert metrics["models"][NAME]["sha256"] == hashlib.sha256(run.model(NAME).read_bytes()).hexdigest()
     metrics["lpips_network"] = "alex"
     for split in per_view[NAME].values():
         for view in split.values():
@@ -506,7 +506,7 @@ def test_a_signal_in_training_keeps_its_state(scene, stopped, tmp_path, monkeypa
 
 
 def test_a_second_signal_ends_the_program_at_once():
-    with pytest.raises(signals.Stopped) as raised, signals.noted() as is_asked:
+    with pytest.raises(signals.Stopped) as raised, signals.stop_on_signals() as is_asked:
         assert not is_asked()
         os.kill(os.getpid(), signal.SIGINT)
         assert is_asked()

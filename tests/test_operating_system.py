@@ -81,10 +81,10 @@ def test_cores_and_features(monkeypatch, tmp_path):
 
 @pytest.mark.parametrize("library", [SimpleNamespace(), None])
 def test_a_heap_is_trimmed_only_by_a_library_that_can(monkeypatch, library):
-    monkeypatch.setattr(operating_system, "_c_library", lambda: library)
+    monkeypatch.setattr(operating_system, "c_library", lambda: library)
     operating_system.trim_heap()
     trimmed = []
-    monkeypatch.setattr(operating_system, "_c_library", lambda: SimpleNamespace(malloc_trim=trimmed.append))
+    monkeypatch.setattr(operating_system, "c_library", lambda: SimpleNamespace(malloc_trim=trimmed.append))
     operating_system.trim_heap()
     assert trimmed == [0]
 
@@ -176,7 +176,7 @@ def test_files_of_the_project_can_lie_on_every_system():
 
 @pytest.mark.parametrize("num", [1, 2])
 def test_a_noted_signal_ends_the_block_and_a_second_one_does_at_once(num):
-    with pytest.raises(KeyboardInterrupt), signals.noted((signals.CTRL_C,)) as is_interrupted:
+    with pytest.raises(KeyboardInterrupt), signals.stop_on_signals((signals.CTRL_C,)) as is_interrupted:
         assert not is_interrupted()
         for _ in range(num):
             signal.raise_signal(signal.SIGINT)

@@ -10,7 +10,6 @@ from small_models import some_gaussians
 
 import a2tg_jax as a2tg
 from a2tg_jax import adam_init, adam_update, exponential_decay
-from a2tg_jax.core.optim import OptStep
 from a2tg_jax.training.step import initial_state, optimized
 
 
@@ -75,7 +74,7 @@ def test_without_decay_the_present_gradient_alone_counts():
 def test_one_rate_may_be_of_a_subtree():
     params = {"a": jnp.ones(2), "b": {"c": jnp.ones(3), "d": jnp.ones(1)}}
     result = adam_update(params, params, adam_init(params), {"a": 0.0, "b": 0.5})
-    assert isinstance(result, OptStep)
+    assert result._fields == ("params", "state")
     np.testing.assert_array_equal(result.params["a"], params["a"])
     for leaf in result.params["b"].values():
         np.testing.assert_allclose(leaf, 0.5, rtol=1e-6)

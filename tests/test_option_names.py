@@ -7,10 +7,9 @@ import pytest
 from toy_system import Shrink, Toy
 
 import a2tg_jax as a2tg
-from a2tg_jax import find_system
+from a2tg_jax import HostEvent, StepEvent, find_system
 from a2tg_jax.core.config_json import changed_config, flatten_config
-from a2tg_jax.events import Event
-from a2tg_jax.training.registry import SYSTEMS
+from a2tg_jax.training import SYSTEMS
 
 WITH_AND_WITHOUT = pytest.mark.parametrize("budget", [None, "9MB"])
 ALL = pytest.mark.parametrize("name", SYSTEMS)
@@ -43,7 +42,7 @@ def test_every_group_checks_its_own_numbers(name):
     system = find_system(name)
     for path, value in flatten_config(system).items():
         group, _, field = path.partition(".")
-        if isinstance(getattr(system, group), Event) and type(value) in (int, float):
+        if isinstance(getattr(system, group), StepEvent | HostEvent) and type(value) in (int, float):
             with pytest.raises(ValueError, match=rf"^{re.escape(path)} must "):
                 changed_config(system, {group: {field: type(value)(-1)}}, "test").check()
 

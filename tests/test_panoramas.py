@@ -9,22 +9,21 @@ from PIL import Image, PngImagePlugin
 from scipy.ndimage import map_coordinates
 from test_data_sfm import cameras_of, staged
 
-from a2tg_jax import load_scene, with_validation_views
-from a2tg_jax.core.cameras import looking
+from a2tg_jax import load_scene, look_at, with_validation_views
 from a2tg_jax.data import synthetic
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.decoding import picture_facts
 from a2tg_jax.data.panoramas import projection_of
 from a2tg_jax.data.staging import cut_view, directions, view_size
 
-CENTER = np.array([0.3, -1.2, 1.2])
+CENTER, TARGET = np.array([0.3, -1.2, 1.2]), (0, 0.1, 0.45)
 WIDTH, FACE = 640, 224
 
 
 def camera(rotation):
     """World to camera of a view with a rotation from the panorama's frame."""
     viewmat = np.eye(4)
-    viewmat[:3, :3] = rotation @ looking(CENTER, synthetic.TARGET - CENTER, synthetic.DOWN)[:3, :3]
+    viewmat[:3, :3] = rotation @ look_at(CENTER, TARGET, width=1, height=1).viewmat[:3, :3]
     viewmat[:3, 3] = -viewmat[:3, :3] @ CENTER
     return viewmat
 

@@ -5,11 +5,10 @@ import json
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from small_values import centers_of
 
 from a2tg_jax import Camera, look_at, path_through
 from a2tg_jax.core.camera_paths import central_camera, turntable, vertical_of
-from a2tg_jax.core.cameras import looking
-from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.io.path_file import load_views
 
 
@@ -93,12 +92,12 @@ def test_one_view_is_a_still_flight_and_equal_views_do_no_harm():
 
 def ring(num: int = 12, rolled: float = 0.0) -> list[Camera]:
     """Level cameras on an arc of 80° that look at (1, 2, 3) from above, each rolled a little."""
-    subject, up = np.array([1.0, 2.0, 3.0]), np.array([0.0, 0.0, 1.0])
+    subject = np.array([1.0, 2.0, 3.0])
     cameras = []
     for index, angle in enumerate(np.radians(np.linspace(-40, 40, num))):
         tilt = np.radians(26 + 11 * np.sin(2 * index))
         outward = np.array([np.cos(tilt) * np.cos(angle), np.cos(tilt) * np.sin(angle), np.sin(tilt)])
-        viewmat = looking(subject + 4 * outward, -outward, -up)
+        viewmat = np.array(look_at(subject + 4 * outward, subject, width=64, height=48).viewmat)
         roll = Rotation.from_rotvec([0, 0, rolled * (-1) ** index]).as_matrix()
         viewmat[:3] = roll @ viewmat[:3]
         cameras.append(Camera(viewmat.astype(np.float32), np.diag([60, 60, 1]).astype(np.float32), 64, 48))
@@ -108,7 +107,7 @@ def ring(num: int = 12, rolled: float = 0.0) -> list[Camera]:
 def test_a_turntable_is_a_level_closed_loop_around_the_subject():
     orbit = turntable(ring(rolled=0.05), 36)
     viewmats = np.array([camera.viewmat for camera in orbit], np.float64)
-    centers, up = camera_centers(viewmats), vertical_of(np.array([c.viewmat for c in ring(rolled=0.05)]))
+    centers, up = centers_of(viewmats), vertical_of(np.array([c.viewmat for c in ring(rolled=0.05)]))
     assert up[2] > 0.995
     to_subject = [1, 2, 3] - centers
     np.testing.assert_allclose(np.linalg.norm(to_subject, axis=1), 4.0, rtol=1e-4)
@@ -125,7 +124,7 @@ def test_a_turntable_is_a_level_closed_loop_around_the_subject():
 def test_the_most_central_camera_is_in_the_middle_and_looks_at_the_subject():
     viewmats = np.array([camera.viewmat for camera in ring(13)])
     assert abs(central_camera(viewmats) - 6) <= 1
-    centers = camera_centers(viewmats)
+    centers = centers_of(viewmats)
     viewmats[5:8, :3, :3] = Rotation.from_euler("y", 20, degrees=True).as_matrix() @ viewmats[5:8, :3, :3]
     viewmats[5:8, :3, 3] = -np.einsum("vij,vj->vi", viewmats[5:8, :3, :3], centers[5:8])
     assert central_camera(viewmats) in (4, 8)

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from bits import bits_of
 from kept_checkpoints import fit_keeping_checkpoints
+from small_values import SH_C0, rotations
 
 import a2tg_jax as a2tg
 from a2tg_jax import Due, PlaceByError, View, adam_init, partition
-from a2tg_jax.core.gaussians import SH_C0, no_rows, rotation_matrices
-from a2tg_jax.core.origin import BLACK, WHITE, Color
 from a2tg_jax.densify.placing import OPACITY, gaussians_at_errors
 
 DEPTH, FOCAL, SIZE = 4.0, 20.0, (16, 24)
@@ -32,8 +31,7 @@ def wall() -> a2tg.Model:
         logit_opacities=jnp.array([8.0]),
         sh=(jnp.array([[[1.0, 0.0, 0.0]]]) - 0.5) / SH_C0,
     )
-    spare = no_rows(30, 1)
-    joined = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), gaussians, spare)
+    joined = jax.tree.map(lambda a: jnp.concatenate([a, jnp.zeros((30, *a.shape[1:]))]), gaussians)
     return a2tg.Model(joined, num_live=jnp.asarray(1, jnp.int32))
 
 
@@ -53,7 +51,7 @@ def seen(picture: np.ndarray, mask: np.ndarray | None = None) -> View:
     return View("wall.png", camera(), picture, mask)
 
 
-def placed(views: list[View], num: int = 20, background: Color = BLACK) -> a2tg.Gaussians:
+def placed(views: list[View], num: int = 20, background: tuple = (0, 0, 0)) -> a2tg.Gaussians:
     return gaussians_at_errors(wall(), views, background, num, np.random.default_rng(0))
 
 
@@ -74,7 +72,7 @@ def test_they_are_on_the_surface_at_the_wrong_pixels_and_of_their_colour():
     np.testing.assert_allclose(new.scales, np.repeat(means[:, 2:] / FOCAL, 2, axis=1), rtol=1e-4)
     np.testing.assert_allclose(new.opacities, OPACITY, rtol=1e-5)
     # In the plane of the wall, whose normal is (TILT, 0, −1), in either direction.
-    normals = np.asarray(rotation_matrices(new.quats))[:, :, 2]
+    normals = rotations(new.quats)[:, :, 2]
     expected = np.array([TILT, 0, -1]) / np.hypot(TILT, 1)
     np.testing.assert_allclose(np.abs(normals @ expected), 1, atol=1e-5)
     angles = np.asarray(new.quats)
@@ -100,14 +98,14 @@ def test_what_masks_leave_out_and_what_shows_no_surface_gets_none():
     faint = dataclasses.replace(model.gaussians, logit_opacities=jnp.full(model.gaussians.num, -1.0))
     views = [seen(photograph(5, 8, (0, 0, 255)))]
     model = dataclasses.replace(model, gaussians=faint)
-    found = gaussians_at_errors(model, views, BLACK, 20, np.random.default_rng(0))
+    found = gaussians_at_errors(model, views, (0, 0, 0), 20, np.random.default_rng(0))
     assert found.num == 0, "an alpha of 0.27"
 
 
 def test_transparent_pixels_have_the_colour_of_the_background():
     picture = np.full((*SIZE, 4), (255, 3, 3, 255), np.uint8)  # As an alpha of 0.99 draws red before white.
     picture[:, 5:8, 3] = 0
-    new = placed([seen(picture)], background=WHITE)
+    new = placed([seen(picture)], background=(1, 1, 1))
     columns = columns_of(new)
     assert new.num == 20 and columns.min() > 5 and columns.max() < 8
     np.testing.assert_allclose(np.asarray(new.sh[:, 0]) * SH_C0 + 0.5, 1, atol=1e-5)

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from small_values import SH_C0
 
 from a2tg_jax import load_ply
-from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.data.ply import PlyFile
 from a2tg_jax.io.ply import unpacked_vertices
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from on_processes import SHORT, ended, free_port, pair, started, survivor_of, trainings
 from run_folders import create_run
+from small_files import write_archive
 
 import a2tg_jax as a2tg
 from a2tg_jax import Session, fit_stage, load_model
-from a2tg_jax.base.archive import write_archive
 from a2tg_jax.base.machine import Devices
 from a2tg_jax.cli import main as cli
 from a2tg_jax.cli.processes import LOST, is_lost
@@ -97,7 +97,8 @@ def test_the_command_to_go_on_names_devices_and_processes(tmp_path):
     path.parent.mkdir()
     path.write_bytes(b"damaged")
     assert resuming_command(run) == f"a2tg train --out {tmp_path} --resume"
-    write_archive(path, {"devices": {"each": 4, "processes": 1}}, {})
+    header = {"format": "a2tg-jax checkpoint", "version": 1, "devices": {"each": 4, "processes": 1}}
+    write_archive(path, header, {})
     assert resuming_command(run) == f"a2tg train --out {tmp_path} --resume --devices 4"
     by_two = "--devices 1 --coordinator HOST:PORT --num-processes 2 --process-id I"
     assert resuming_command(run, Devices(1, 2)) == f"a2tg train --out {tmp_path} --resume {by_two}"

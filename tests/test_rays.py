@@ -14,7 +14,6 @@ from scenes_random import CAPACITY, as_camera, as_gaussians, as_textures, draw_s
 
 import a2tg_jax as a2tg
 from a2tg_jax import Appearance, Camera, Model, Prune, normal_consistency
-from a2tg_jax.core.cameras import looking
 from a2tg_jax.rasterize.room import most_pairs
 from a2tg_jax.scene import kinds_of, ray_bytes
 from a2tg_jax.training import batches
@@ -178,17 +177,13 @@ def write_fisheye(folder, num_views=4, focal=20.0, size=(32, 24), **more):
     frames = []
     for index in range(num_views):
         Image.fromarray(rng.integers(180, 256, (height, width, 3), np.uint8)).save(folder / f"{index}.png")
-        camera_to_world = np.linalg.inv(looking(np.array([np.cos(index), np.sin(index), 0.3]) * 3, *aim(index)))
+        place = 3 * np.array([np.cos(index), np.sin(index), 0.3])
+        camera_to_world = np.linalg.inv(a2tg.look_at(place, np.zeros(3), width=width, height=height).viewmat)
         pose = camera_to_world @ np.diag([1.0, -1.0, -1.0, 1.0])
         frames.append({"file_path": f"{index}.png", "transform_matrix": pose.tolist()})
     lens = {"camera_model": "OPENCV_FISHEYE", "k1": 0.05, "k2": 0.0, "k3": 0.0, "k4": 0.0, "fl_x": focal, **more}
     (folder / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
     return folder
-
-
-def aim(index):
-    """The direction in which the camera of a place looks, and down."""
-    return -np.array([np.cos(index), np.sin(index), 0.3]), np.array([0.0, 0.0, -1.0])
 
 
 @pytest.fixture(scope="module")

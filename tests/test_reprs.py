@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from scenes_random import as_camera, as_gaussians, draw_scene
-from small_models import some_model, with_row
+from small_models import some_checkpoint, some_model, with_row
 
 import a2tg_jax as a2tg
 from a2tg_jax import (
@@ -32,7 +32,6 @@ from a2tg_jax import (
     ViewMetrics,
     allocate_appearance,
 )
-from a2tg_jax.training.step import TrainState
 
 CAMERA = as_camera(draw_scene(0, width=21, height=13), "float32")
 MASK = np.arange(13 * 21).reshape(13, 21) % 2 == 0
@@ -134,14 +133,12 @@ def some_output(*views: int) -> RenderOutput:
 
 
 def test_a_checkpoint_whose_buffers_are_reused_says_so():
-    num_live = jnp.int32(5)
-    model = dataclasses.replace(some_model(), num_live=num_live)
-    state = TrainState(model, None, (), jnp.int32(7), jnp.int32(0))
-    checkpoint = Checkpoint(A2tg(), 0, state, History.empty())
-    assert repr(checkpoint) == "Checkpoint(A2tg, stage 1, iteration 7, 5 Gaussians)"
-    num_live.delete()
+    checkpoint = some_checkpoint(A2tg(sh_degree=0))
+    model, state = checkpoint.state.model, checkpoint.state
+    assert repr(checkpoint) == "Checkpoint(A2tg, stage 2, iteration 0, 10 Gaussians)"
+    model.num_live.delete()
     state.iteration.delete()
-    assert repr(checkpoint) == "Checkpoint(A2tg, stage 1, its arrays reused by the next iteration)"
+    assert repr(checkpoint) == "Checkpoint(A2tg, stage 2, its arrays reused by the next iteration)"
     assert repr(model).startswith("Model(gaussians=Gaussians(means=float32[")
 
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from run_folders import NAMES, RECORD, circle, create_run, some_history, some_result, tensorboard_scalars
-from small_models import with_row
+from small_models import movable_kernels, origin_of, with_row
 
 import a2tg_jax as a2tg
 from a2tg_jax import (
@@ -41,7 +41,6 @@ from a2tg_jax import (
     synthetic_scene,
     view_image,
 )
-from a2tg_jax.appearance import MovableKernels
 from a2tg_jax.base.text import in_bytes
 from a2tg_jax.cli import main as cli, runs
 from a2tg_jax.measure import evaluation
@@ -64,7 +63,6 @@ from a2tg_jax.results.report import (
 )
 from a2tg_jax.results.run_evaluation import check_held_out, evaluate_run
 from a2tg_jax.results.run_training import RunOptions, train_run
-from a2tg_jax.scene import origin_of_scene
 
 needs_tensorboard = pytest.mark.skipif(
     importlib.util.find_spec("tensorboardX") is None, reason="the extra [tensorboard] is not installed"
@@ -106,12 +104,12 @@ def test_views_of_the_training_are_not_scored_as_held_out(tmp_path):
     grown = dataclasses.replace(scene, train=scene.train[1:], test=(*scene.test, scene.train[0]))
     run = with_record(tmp_path / "run", RunRecord(SceneSource("synthetic"), "a2tg", A2tg.preset("smoke")))
     gaussians = init_from_points(scene.points, scene.colors)
-    save_model(run.model("a2tg-gaussians"), Model(gaussians, origin=origin_of_scene(scene)))
+    save_model(run.model("a2tg-gaussians"), Model(gaussians, origin=origin_of(scene)))
     message = rf"a2tg-gaussians.npz was trained on 1 view that synthetic now holds out, such as {scene.train[0].name}"
     for action in (lambda: evaluate_run(run, grown), lambda: train_run(run, grown, RunOptions())):
         with pytest.raises(ValueError, match=message):
             action()
-    check_held_out(Model(gaussians, origin=origin_of_scene(grown)), scene, run.path)
+    check_held_out(Model(gaussians, origin=origin_of(grown)), scene, run.path)
     check_held_out(Model(gaussians), grown, run.path)
 
 
@@ -297,7 +295,7 @@ def test_files_are_not_replaced_without_a_flag(tmp_path, monkeypatch, capsys, wo
 
 
 def test_conversion_reports_what_ply_does_not_keep(tmp_path, capsys):
-    appearance = allocate_appearance(MovableKernels(), jax.random.key(0), a_model().gaussians)
+    appearance = allocate_appearance(movable_kernels(), jax.random.key(0), a_model().gaussians)
     model, lost = a2tg.Model(a_model().gaussians, appearance), "what MovableKernels shows besides Gaussians"
     for given, line in ((model, f"not kept by this format: {lost}\n"), (a_model(), "")):
         a2tg.save_model(tmp_path / "a.npz", given)

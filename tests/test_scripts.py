@@ -10,10 +10,10 @@ import sys
 import numpy as np
 import pytest
 from PIL import Image
+from small_models import origin_of
 
 import a2tg_jax as a2tg
 from a2tg_jax.results.model_source import Source
-from a2tg_jax.scene import origin_of_scene
 
 ROOT = pathlib.Path(__file__).parents[1]
 sys.path.append(str(ROOT))  # Last, so that the installed package comes first.
@@ -109,7 +109,7 @@ def test_the_loop_of_the_readme_is_drawn(tmp_path):
 
     scene = a2tg.synthetic_scene(num_views=4, width=24, height=16, num_points=50)
     gaussians = a2tg.init_from_points(scene.points, scene.colors)
-    a2tg.save_model(tmp_path / "model.npz", a2tg.Model(gaussians, origin=origin_of_scene(scene)))
+    a2tg.save_model(tmp_path / "model.npz", a2tg.Model(gaussians, origin=origin_of(scene)))
     loop.main(tmp_path / "model.npz", tmp_path / "loop.webp", num_frames=3)
     with Image.open(tmp_path / "loop.webp") as picture:
         assert picture.n_frames == 4 and picture.size == (24, 16)

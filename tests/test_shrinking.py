@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from run_folders import circle
+from small_models import assert_same_rule, movable_kernels
+from small_values import SH_C0
 
 import a2tg_jax as a2tg
 from a2tg_jax import (
@@ -23,8 +25,6 @@ from a2tg_jax import (
     texture_arrays,
     textures_from_arrays,
 )
-from a2tg_jax.appearance import MovableKernels, template_of
-from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.finish.shrinking import halve_textures, taken, texel_weights
 from a2tg_jax.results.images import to_uint8
 
@@ -128,7 +128,8 @@ def test_bands_and_shapes_stay_as_they_are():
     appearance = dataclasses.replace(model.appearance, exponents=shapes, bands=bands)
     model = Model(model.gaussians, appearance)
     small = shrink_textures(model, views_of(model), max_loss=0.05, background=BACKGROUND)
-    assert template_of(small.appearance) == template_of(model.appearance) and small.num_bytes < model.num_bytes
+    assert_same_rule(small, model)
+    assert small.num_bytes < model.num_bytes
     np.testing.assert_array_equal(small.appearance.shapes, model.appearance.shapes)
 
 
@@ -138,7 +139,7 @@ def test_what_cannot_shrink_is_refused():
     for template, name in (
         (Appearance(), "plain Gaussians"),
         (Appearance(texture=Texture(options=TextureOptions.official())), "Gaussians with texture"),
-        (MovableKernels(), "MovableKernels"),
+        (movable_kernels(), "MovableKernels"),
         (Appearance(bands=Bands(), exponents=Exponents()), "Gaussians with exponents and bands"),
     ):
         other = Model(model.gaussians, allocate_appearance(template, jax.random.key(0), model.gaussians))

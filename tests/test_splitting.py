@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_models import some_now
+from small_values import rotations
 from test_mcmc import random_gaussians
 
 import a2tg_jax as a2tg
 from a2tg_jax import AdamState, GradientStatistics, Model, Seen, SplitByGradient, adam_init, partition
-from a2tg_jax.core.gaussians import rotation_matrices
 from a2tg_jax.densify.splitting import SplitStatistics, draw_distinct_hosts, draw_weights, logits_of_halves, split_rows
 from a2tg_jax.mcmc import plan_growth, plan_relocation
 
@@ -97,7 +97,7 @@ def test_hosts_and_copies_become_halves(seed):
     for field in ("quats", "logit_opacities", "sh"):
         np.testing.assert_array_equal(getattr(after.gaussians, field), getattr(before, field))
     # They stay in the plane of their host, a few of its standard deviations away, and others stay where they are.
-    axes = np.asarray(rotation_matrices(before.quats))
+    axes = rotations(before.quats)
     moved = np.einsum("nij,ni->nj", axes, np.asarray(after.gaussians.means - before.means))
     np.testing.assert_array_equal(moved[~is_split], 0)
     assert np.abs(moved[:, 2]).max() < 1e-5

@@ -16,13 +16,13 @@ from toy_system import Toy
 import a2tg_jax as a2tg
 from a2tg_jax import adam_init, combine, fit_stage, partition
 from a2tg_jax.core.config_json import changed_config
+from a2tg_jax.training import SYSTEMS
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.options import own_options
-from a2tg_jax.training.registry import SYSTEMS, system_from_dict, system_to_dict
+from a2tg_jax.training.registry import system_from_dict, system_to_dict
 from a2tg_jax.training.start import initial_model
 from a2tg_jax.training.step import jitted_step
-from a2tg_jax.training.terms import opacity
 
 BUDGETS = {"textured-gaussians": "39.1kB", "supergaussians": "27.3kB", "bbsplat": "346kB"}
 """Room for 80 Gaussians; the other systems have budgets in `test_budget`."""
@@ -364,6 +364,7 @@ def test_the_opacity_term_acts_on_what_a_billboard_shows():
     """Billboards do not use the Gaussians' opacity: the term fades their pictures."""
     model = dataclasses.replace(some_model(tiny("bbsplat", sh_degree=0)), num_live=jnp.int32(12))
     floats, rest = partition(model)
+    _, opacity = a2tg.LossConfig(opacity_weight=1.0).terms()
     slopes = jax.grad(lambda floats: opacity(combine(floats, rest), None, None))(floats)
     assert not np.asarray(slopes.gaussians.logit_opacities).any()
     assert sum(float(jnp.sum(leaf)) for leaf in jax.tree.leaves(slopes.appearance)) > 0

@@ -7,7 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_values import some_gaussians
+from small_files import GROUPS, compact_bytes, grids_of, half_turned, model_in
+from small_models import numbers_of, origin_of
+from small_values import moved_by, some_gaussians
 from test_compact import MODELS, SETTINGS, order_of
 from test_compaction import SCENE, a_model
 
@@ -26,8 +28,6 @@ from a2tg_jax import (
     loss_on_views,
     tune_compact,
 )
-from a2tg_jax.appearance import files
-from a2tg_jax.core.cameras import moved_viewmat
 from a2tg_jax.finish import tuning
 from a2tg_jax.finish.compaction import TooLargeError
 from a2tg_jax.finish.tuning import (
@@ -40,10 +40,7 @@ from a2tg_jax.finish.tuning import (
     partly_rounded,
     smallest_tuned,
 )
-from a2tg_jax.io.compact import GROUPS, decode_model, encode_model, grids_of, half_turned
 from a2tg_jax.results.run_evaluation import refined_views
-from a2tg_jax.scene import origin_of_scene
-from a2tg_jax.training.corrections import exposed
 
 COARSE = CompactChoices(
     means=14, log_scales=4, quats=4, opacities=3, sh_0=4, sh_rest=3, texels=3, shapes=3, coder="none"
@@ -61,15 +58,9 @@ def moved(model: Model, size: float = 0.05) -> Model:
     return a2tg.combine(floats, rest)
 
 
-def arrays_of(model: Model) -> dict[str, np.ndarray]:
-    own = {field.name: getattr(model.gaussians, field.name) for field in dataclasses.fields(model.gaussians)}
-    shown = files.arrays_of(model.appearance, model.gaussians.sh_degree)
-    return {name: np.asarray(x) for name, x in (own | shown).items()}
-
-
 def assert_same(found: Model, wanted: Model) -> None:
-    for name, values in arrays_of(found).items():
-        np.testing.assert_allclose(values, arrays_of(wanted)[name], rtol=2e-5, atol=2e-6, err_msg=name)
+    for name, values in numbers_of(found).items():
+        np.testing.assert_allclose(values, numbers_of(wanted)[name], rtol=2e-5, atol=2e-6, err_msg=name)
 
 
 @pytest.mark.parametrize(
@@ -80,11 +71,11 @@ def test_training_and_the_file_round_alike(name):
     """Numbers that training has moved beyond the ends of the grids as well."""
     start = half_turned(MODELS[name]())
     grids = grids_of(start, COARSE)
-    assert encode_model(start, COARSE, grids) == encode_model(start, COARSE)
+    assert compact_bytes(start, COARSE, grids) == compact_bytes(start, COARSE)
     changed = moved(start)
     rounded = round_to(GridRounding.to(grids, COARSE), changed)
-    assert encode_model(changed, COARSE, grids) == encode_model(rounded, COARSE, grids)
-    found = decode_model(encode_model(rounded, COARSE, grids))
+    assert compact_bytes(changed, COARSE, grids) == compact_bytes(rounded, COARSE, grids)
+    found = model_in(compact_bytes(rounded, COARSE, grids))
     assert_same(found, rounded[order_of(rounded, found)])
     camera = start.origin.cameras[0]
     images = [np.asarray(one.render(camera, settings=SETTINGS).color) for one in (found, rounded, changed)]
@@ -135,7 +126,7 @@ def test_tuning_makes_up_for_rounding():
     """It ends above the same training whose result is rounded afterwards, and below the one without rounding."""
     fine = tuned_model(FINE).model
     loss = loss_on_views(fine, SCENE.train)
-    lost, untuned = loss(tuned_model().model), loss(decode_model(encode_model(fine, COARSE)))
+    lost, untuned = loss(tuned_model().model), loss(model_in(compact_bytes(fine, COARSE)))
     assert untuned > 1 and 0 < lost < 0.8 * untuned
     assert tuned_model().model.origin == fine.origin == a_model().origin
 
@@ -143,7 +134,7 @@ def test_tuning_makes_up_for_rounding():
 @pytest.mark.long
 def test_the_file_holds_the_tuned_model(tmp_path):
     found = tuned_model()
-    again = decode_model(found.data)
+    again = model_in(found.data)
     assert_same(again, found.model[order_of(found.model, again)])
     assert abs(loss_on_views(found.model, SCENE.train)(again)) < 1e-4
     assert_same(round_to(GridRounding.to(found.grids, found.choices), found.model), found.model)
@@ -155,7 +146,7 @@ def test_models_with_textures_are_tuned():
     system = a2tg.find_system("a2tg").preset("smoke", sh_degree=0)
     appearance = allocate_appearance(system.stages()[-1].appearance, jax.random.key(0), a_model().gaussians)
     found = tune_compact(dataclasses.replace(a_model(), appearance=appearance), SCENE, system, COARSE, iterations=2)
-    assert found.model.textures is not None and decode_model(found.data).num == a_model().num
+    assert found.model.textures is not None and model_in(found.data).num == a_model().num
 
 
 def shaped_model():
@@ -192,9 +183,9 @@ CORRECTED = dataclasses.replace(SYSTEM, exposure=True, refine_poses=True)
 
 def misplaced(view, exposure, twist):
     """The view as a camera took it that is exposed so, and whose pose is off by a twist."""
-    viewmat = moved_viewmat(jnp.asarray([*-twist[:3], 0, 0, 0]), view.camera.viewmat.at[:3, 3].add(-twist[3:]))
-    pixels = np.clip(exposed(jnp.asarray(exposure), jnp.asarray(view.image / 255)), 0, 1)
-    camera = dataclasses.replace(view.camera, viewmat=viewmat.astype(np.float32))
+    viewmat = moved_by([*-twist[:3], 0, 0, 0], view.camera.viewmat.at[:3, 3].add(-twist[3:]))
+    pixels = np.clip(view.image / 255 @ exposure[:, :3].T + exposure[:, 3], 0, 1)
+    camera = dataclasses.replace(view.camera, viewmat=jnp.asarray(viewmat))
     return dataclasses.replace(view, camera=camera, picture=np.round(255 * pixels).astype(np.uint8))
 
 
@@ -202,7 +193,7 @@ def misplaced(view, exposure, twist):
 def corrected() -> tuple[Scene, Model]:
     """A scene of misplaced views, and a model that has learned how they are."""
     views = tuple(map(misplaced, SCENE.train, EXPOSURES, TWISTS))
-    origin, num_test = origin_of_scene(SCENE), len(SCENE.test)
+    origin, num_test = origin_of(SCENE), len(SCENE.test)
     learned = {
         "exposure": np.concatenate([EXPOSURES, np.tile(np.eye(3, 4), (num_test, 1, 1))]),
         "pose": np.concatenate([TWISTS, np.zeros((num_test, 6))]),

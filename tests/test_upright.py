@@ -13,7 +13,6 @@ import a2tg_jax as a2tg
 from a2tg_jax import Camera, Origin, Similarity
 from a2tg_jax.cli.main import main
 from a2tg_jax.core.camera_paths import upright_rotation, vertical_of
-from a2tg_jax.core.cameras import looking
 
 UP_AXES = [sign * axis for axis in np.eye(3) for sign in (1, -1)]
 FILE_UP = np.array([0.0, -1.0, 0.0])
@@ -24,8 +23,8 @@ def captured(to_original: Similarity, num: int = 12) -> a2tg.Model:
     cameras, K = [], jnp.asarray([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
     for angle in np.linspace(0, 2 * np.pi, num, endpoint=False):
         outward = np.array([np.cos(angle), np.sin(angle), 0.5 + 0.3 * np.sin(3 * angle)])
-        viewmat = looking(4 * outward, -outward, np.array([0.0, 0.0, -1.0]))
-        cameras.append(Camera(jnp.asarray(viewmat, jnp.float32), K, 64, 48))
+        viewmat = a2tg.look_at(4 * outward, np.zeros(3), width=64, height=48).viewmat
+        cameras.append(Camera(viewmat, K, 64, 48))
     origin = Origin.of_cameras(cameras, transform=to_original.inverse())
     return a2tg.Model(some_gaussians(60), background=(0.2, 0.4, 0.6), origin=origin)
 

@@ -5,13 +5,13 @@ import sys
 
 import numpy as np
 import pytest
-from small_values import some_gaussians, some_world
+from small_values import matrix_of, some_gaussians, some_world
 from test_compact import MODELS, plain, textured
 from test_gltf import assert_shows_the_same
 
 from a2tg_jax import Model, Similarity, load_usd, save_usd
 from a2tg_jax.io import usd_fields
-from a2tg_jax.io.other_programs import joined_parts, matrix_of, upright
+from a2tg_jax.io.other_programs import joined_parts, upright
 
 pxr = pytest.importorskip("pxr", reason="usd-core is missing: pip install 'a2tg-jax[usd]'")
 from pxr import Gf, Usd, UsdGeom, UsdValidation, UsdVol, Vt  # noqa: E402

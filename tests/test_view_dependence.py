@@ -9,11 +9,13 @@ import oracle
 import pytest
 from scenes_random import as_camera, as_gaussians, draw_scene
 from scipy.spatial.transform import Rotation
+from small_files import read_archive, write_archive
+from small_models import assert_same_rule, billboards, movable_kernels, rule_of, with_bands
+from small_values import some_gaussians
 
 from a2tg_jax import (
     AdaptDegrees,
     Appearance,
-    Bands,
     Due,
     Exponents,
     Gaussians2dMcmc,
@@ -34,13 +36,10 @@ from a2tg_jax import (
     save_model,
     save_ply,
 )
-from a2tg_jax.appearance import Billboards, MovableKernels, template_of
-from a2tg_jax.appearance.parts import bands_of_dense, dense_bands, empty_bands, floats_of_band, sizes_of_degrees
-from a2tg_jax.base.archive import read_archive, write_archive
+from a2tg_jax.appearance.parts import empty_bands, floats_of_band, sizes_of_degrees
 from a2tg_jax.core.budget import within_budget
 from a2tg_jax.core.table import Shape, bucket_capacity, resize
 from a2tg_jax.densify.view_dependence import ViewDependence, most_blocks, raised_degrees, without_idle
-from a2tg_jax.model_file import FORMAT
 from a2tg_jax.training.start import padded
 
 NUM = 40
@@ -65,9 +64,8 @@ def banded(seed: int, base: int = 0, dtype: str = "float32", template: Appearanc
     full = dataclasses.replace(full, sh=jnp.asarray(cut(np.asarray(full.sh), degrees), full.means.dtype))
     gaussians = dataclasses.replace(full, sh=full.sh[:, : (base + 1) ** 2])
     plain = Model(full, allocate_appearance(template, jax.random.key(0), gaussians))
-    coefficients = bands_of_dense(full.sh[:, (base + 1) ** 2 :], degrees, base)
-    appearance = dataclasses.replace(plain.appearance, bands=Bands(coefficients))
-    return Model(gaussians, appearance), plain, as_camera(scene, dtype)
+    model = with_bands(Model(gaussians, plain.appearance), full.sh[:, (base + 1) ** 2 :], degrees)
+    return model, plain, as_camera(scene, dtype)
 
 
 @pytest.mark.usefixtures("x64")
@@ -111,8 +109,8 @@ def test_gradients_are_those_of_the_dense_coefficients():
     [
         Appearance(texture=Texture(start=(2, 1)), exponents=Exponents()),
         Appearance(texture=Texture(start=(0, 0))),
-        MovableKernels(),
-        Billboards(side=3),
+        movable_kernels(),
+        billboards(side=3),
     ],
 )
 def test_whatever_else_is_shown_is_as_without(template, tmp_path):
@@ -121,7 +119,8 @@ def test_whatever_else_is_shown_is_as_without(template, tmp_path):
     np.testing.assert_allclose(model.render(camera).color, expected, atol=1e-6)
     save_model(tmp_path / "m.npz", dataclasses.replace(model, num_live=jnp.int32(30)))
     loaded = load_model(tmp_path / "m.npz")
-    assert template_of(loaded.appearance) == template_of(model.appearance) and loaded.num == 30
+    assert_same_rule(loaded, model)
+    assert loaded.num == 30
     np.testing.assert_array_equal(loaded.degrees, model.degrees[:30])
     shorter = dataclasses.replace(plain, num_live=jnp.int32(30))
     np.testing.assert_allclose(loaded.render(camera).color, shorter.render(camera).color, atol=1e-6)
@@ -144,8 +143,9 @@ def test_a_ply_file_and_another_world_have_all_coefficients(tmp_path):
 
 def test_rows_move_while_all_have_one_degree():
     gaussians, rows = as_gaussians(draw_scene(0, num=NUM), "float32"), np.random.default_rng(10).integers(0, NUM, NUM)
-    table = bands_of_dense(gaussians.sh[:, 1:], np.full(NUM, 3), 0)
-    np.testing.assert_array_equal(dense_bands(table.gather(rows), 0), gaussians.sh[rows, 1:])
+    low = Model(dataclasses.replace(gaussians, sh=gaussians.sh[:, :1]))
+    one_degree = with_bands(low, gaussians.sh[:, 1:], np.full(NUM, 3))
+    np.testing.assert_array_equal(one_degree[rows].sh, gaussians.sh[rows])
     model, _, _ = banded(0)
     with pytest.raises(ValueError, match="coefficients of 4 sizes cannot change rows: densify and prune before"):
         model.appearance.coefficients.gather(rows)
@@ -196,7 +196,9 @@ def test_degrees_rise_where_the_gradient_per_byte_is_largest():
 def test_idle_bands_are_given_up():
     degrees, dense = np.array([0, 1, 1, 2]), np.zeros((4, 15, 3), np.float32)
     dense[2, :3] = dense[3, :3] = 1.0
-    np.testing.assert_array_equal(without_idle(bands_of_dense(dense, degrees, 0), 0, 0.01), [0, 0, 1, 1])
+    gaussians = some_gaussians(4)
+    bands = with_bands(Model(dataclasses.replace(gaussians, sh=gaussians.sh[:, :1])), dense, degrees)
+    np.testing.assert_array_equal(without_idle(bands.appearance.coefficients, 0, 0.01), [0, 0, 1, 1])
     np.testing.assert_array_equal(without_idle(empty_bands(degrees, 0), 0, 0.0), degrees)
 
 
@@ -208,7 +210,7 @@ def test_an_event_stays_within_its_budget_and_spends_it(budget_mb):
     colors = jnp.asarray(np.random.default_rng(0).normal(size=(1, NUM, 3)), jnp.float32)
     nothing = jnp.zeros_like(colors)
     seen = Seen(cameras, nothing, jnp.zeros((1, NUM), bool), colors)
-    appearance = allocate_appearance(template_of(model.appearance), jax.random.key(0), model.gaussians)
+    appearance = allocate_appearance(rule_of(model.appearance), jax.random.key(0), model.gaussians)
     base = Model(model.gaussians, appearance)
     state = event.observe(event.init(base), base, seen)
     after = event.apply(Due(), base, adam_init(partition(base)[0]), state).model
@@ -254,18 +256,18 @@ def test_a_file_whose_parts_disagree_is_refused(tmp_path, damage):
         save_model(tmp_path / "m.npz", damaged)
     for name, own in {"whole": model, "part": model[:20], "other": other}.items():
         save_model(tmp_path / f"{name}.npz", own)
-    header, arrays = read_archive(tmp_path / "whole.npz", format=FORMAT)
-    _, others = read_archive(tmp_path / ("other.npz" if damage == "degree" else "part.npz"), format=FORMAT)
+    header, arrays = read_archive(tmp_path / "whole.npz")
+    _, others = read_archive(tmp_path / ("other.npz" if damage == "degree" else "part.npz"))
     names = {"bands": ("degrees", "band_1", "band_2", "band_3"), "texture": ("sizes", "texels")}
     paths = ["sh"] if damage == "degree" else [f"appearance/{name}" for name in names[damage]]
-    write_archive(tmp_path / "m.npz", header, arrays | {path: others[path] for path in paths}, format=FORMAT)
+    write_archive(tmp_path / "m.npz", header, arrays | {path: others[path] for path in paths})
     with pytest.raises(ValueError, match=r"m\.npz: (bands|textures)(\.coefficients)? are (of 20|above degree 0)"):
         load_model(tmp_path / "m.npz")
 
 
 def test_degrees_rise_in_banded_models_only_and_no_gaussians_are_added_then():
     model, _, _ = banded(5)
-    stage = Stage("more", template_of(model.appearance), (Mcmc(2 * NUM),), (), LearningRates(), 100, 0.0)
+    stage = Stage("more", rule_of(model.appearance), (Mcmc(2 * NUM),), (), LearningRates(), 100, 0.0)
     with pytest.raises(ValueError, match="textures or degrees have grown already"):
         padded(model, stage, Gaussians2dMcmc())
     model, event = Model(as_gaussians(draw_scene(1, num=NUM), "float32")), AdaptDegrees(1.0)

@@ -22,6 +22,8 @@ import numpy as np
 import pytest
 from PIL import Image
 from run_folders import create_run
+from small_files import taken_apart
+from small_models import origin_of
 from small_values import some_gaussians
 from test_compact import textured
 
@@ -29,14 +31,12 @@ from a2tg_jax import A2tg, Origin, Similarity, save_compact, save_model, save_pl
 from a2tg_jax.appearance import parts
 from a2tg_jax.base.text import in_bytes
 from a2tg_jax.cli.main import main
-from a2tg_jax.io.compact import unframed
 from a2tg_jax.results import viewing
 from a2tg_jax.results.compression import loss_measures
 from a2tg_jax.results.meshing import MeshOptions, write_mesh
 from a2tg_jax.results.model_source import Source, open_source
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record
 from a2tg_jax.results.viewing import ServedPhotographs, export_comparison, export_web, routes_of
-from a2tg_jax.scene import origin_of_scene
 from a2tg_jax.web import server
 from a2tg_jax.web.page import viewer_html, viewer_html_with
 from a2tg_jax.web.server import ANY, Door, Route, application, lan_address, serve, served
@@ -333,7 +333,7 @@ def test_models_compact_scenes_and_point_clouds_are_opened(tmp_path):
     for name, num in (("a.npz", model.num), ("b.a2tgz", model.num), ("c.ply", some_gaussians().num)):
         source = open_source(tmp_path / name)
         assert source.model.num == num and source.title == name[0] and not source.note
-        assert unframed(source.encoded)[0]["page"]["title"] == name[0]
+        assert taken_apart(source.encoded)[0]["page"]["title"] == name[0]
 
 
 def test_3d_gaussians_are_said_to_be_shown_flat(tmp_path):
@@ -348,7 +348,7 @@ def test_3d_gaussians_are_said_to_be_shown_flat(tmp_path):
     with pytest.warns(UserWarning, match="thinnest axis is dropped"):
         source = open_source(path)
     assert "3D Gaussians" in source.note and str(path) not in source.note
-    assert unframed(source.encoded)[0]["page"]["note"] == source.note
+    assert taken_apart(source.encoded)[0]["page"]["note"] == source.note
 
 
 @pytest.mark.parametrize("name", ["nowhere.npz", "nowhere.a2tgz", "nowhere.ply", "nowhere"])
@@ -374,12 +374,12 @@ def test_a_model_that_knows_no_scene_has_no_photographs():
 
 def test_a_folder_and_a_single_file(tmp_path):
     scene = synthetic_scene(num_views=4, width=24, height=16, num_points=20)
-    source = Source(dataclasses.replace(textured(), origin=origin_of_scene(scene)), "a")
+    source = Source(dataclasses.replace(textured(), origin=origin_of(scene)), "a")
     text, page = export_web(source, tmp_path / "site"), tmp_path / "site" / "index.html"
     assert page.read_text(encoding="utf-8") == viewer_html(is_exported=True) != viewer_html()
     scene = (tmp_path / "site" / "scene.a2tgz").read_bytes()
     assert f"whose scene takes {in_bytes(len(scene))}, " in text and "dB of PSNR lost, for a model of 30 dB" in text
-    assert unframed(scene)[0]["num"] == source.model.num
+    assert taken_apart(scene)[0]["num"] == source.model.num
     total = sum(file.stat().st_size for file in page.parent.iterdir())
     assert text.endswith(f"{page}: {in_bytes(total)} with 2 files next to it")
     assert (tmp_path / "site" / "photographs.json").read_bytes() == b"[]"
@@ -458,7 +458,7 @@ def test_a_page_of_someone_else_is_not_replaced(tmp_path):
 
 def test_photographs_are_those_of_the_cameras():
     scene = synthetic_scene(num_views=4, width=24, height=16, num_points=20)
-    origin = origin_of_scene(scene)
+    origin = origin_of(scene)
     photographs = ServedPhotographs(origin, lambda: scene)
     assert sorted(photographs.views) == [0, 1, 2, 3] and photographs.jpeg(9) is None
     found = np.asarray(Image.open(io.BytesIO(photographs.jpeg(0))), np.float32)
@@ -479,7 +479,7 @@ def test_photographs_that_cannot_be_read_are_not_called_missing(tmp_path, monkey
 
     run, scene = create_run(tmp_path / "run"), synthetic_scene(num_views=4, width=24, height=16, num_points=20)
     write_record(run, RunRecord(SceneSource("synthetic"), "a2tg", A2tg()))
-    save_model(run.model("a2tg-textures"), dataclasses.replace(textured(), origin=origin_of_scene(scene)))
+    save_model(run.model("a2tg-textures"), dataclasses.replace(textured(), origin=origin_of(scene)))
     monkeypatch.setattr(SceneSource, "load", fail)
     source = open_source(run.path)
     with pytest.raises(ValueError, match=printed):

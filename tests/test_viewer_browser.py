@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from small_files import ATTRIBUTES, SCALES
 from viewer_cases import shaped_model, small_model, small_numbers, write_case
 
 import a2tg_jax as a2tg
 from a2tg_jax import Mcmc
 from a2tg_jax.io.edit_file import crop_box
-from a2tg_jax.io.ply import ATTRIBUTES, SCALES
 from a2tg_jax.results.model_source import Source, open_source
 from a2tg_jax.web.page import viewer_html
 

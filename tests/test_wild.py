@@ -11,13 +11,13 @@ from scenes_random import as_camera, as_gaussians, draw_scene
 from test_data_colmap import HEIGHT, WIDTH, write_scene
 
 import a2tg_jax as a2tg
-from a2tg_jax import BilateralGrid, Due, Geometry, adam_init
+from a2tg_jax import BilateralGrid, Due, Geometry, LossConfig, adam_init
 from a2tg_jax.data.photo_reading import find_depths, read_depths
 from a2tg_jax.densify.pruning import are_near, shown_in
 from a2tg_jax.training.batches import stack_views
-from a2tg_jax.training.corrections import exposed, learned, sliced, total_variation
+from a2tg_jax.training.corrections import learned
 from a2tg_jax.training.start import initial_model
-from a2tg_jax.training.terms import DepthPrior, Photometric, RobustPhotometric, depth_loss, inliers, scale_and_shift
+from a2tg_jax.training.terms import inliers, scale_and_shift
 
 RNG = np.random.default_rng(0)
 
@@ -79,7 +79,7 @@ class TestRobust:
         image = jnp.full((32, 32, 3), 0.5, jnp.float32)
         target = a2tg.Target(None, (image + 0.02).at[8:16, 8:16].add(error), jnp.zeros(3), progress=progress)
         output = a2tg.RenderOutput(image, None, None)
-        values = [term(None, target, output) for term in (Photometric(0.2), RobustPhotometric(0.2))]
+        values = [LossConfig(robust_share=share).terms()[0](None, target, output) for share in (0.0, 0.2)]
         np.testing.assert_array_equal(*values)
 
     def test_the_gradient_is_zero_in_what_is_left_out(self):
@@ -87,7 +87,8 @@ class TestRobust:
         target = a2tg.Target(None, (image + 0.02).at[8:16, 8:16].set(1.0), jnp.zeros(3))
 
         def loss(color):
-            return RobustPhotometric(0.0)(None, target, a2tg.RenderOutput(color, None, None))
+            (term,) = LossConfig(ssim_weight=0.0, robust_share=0.2).terms(is_first=False)
+            return term(None, target, a2tg.RenderOutput(color, None, None))
 
         gradient = jax.grad(loss)(image)
         assert not gradient[8:16, 8:16].any() and (gradient[20:] != 0).all()
@@ -97,7 +98,7 @@ class TestBilateralGrid:
     @pytest.mark.usefixtures("x64")
     def test_slices_are_those_of_plain_loops(self):
         grid, color = RNG.normal(size=(3, 2, 4, 3, 4)), RNG.uniform(size=(5, 7, 3))
-        found = sliced(jnp.asarray(grid), jnp.asarray(color))
+        found = BilateralGrid().color(jnp.asarray(grid), jnp.asarray(color))
         for y, x in np.ndindex(5, 7):
             luminance = color[y, x] @ (0.299, 0.587, 0.114)
             places = (luminance * 2, (y + 0.5) / 5 * 1, (x + 0.5) / 7 * 3)
@@ -110,11 +111,11 @@ class TestBilateralGrid:
     @pytest.mark.usefixtures("x64")
     def test_gradients_are_exact(self):
         numbers = np.concatenate([RNG.normal(size=96), RNG.uniform(0.1, 0.4, size=18)])
-        weights = jnp.asarray(RNG.normal(size=(2, 3, 3)))
+        weights, correction = jnp.asarray(RNG.normal(size=(2, 3, 3))), BilateralGrid(smoothness=1.0)
 
         def value(numbers):
             grid, color = numbers[:96].reshape(2, 2, 2, 3, 4), numbers[96:].reshape(2, 3, 3)
-            return jnp.sum(weights * sliced(grid, color)) + total_variation(grid)
+            return jnp.sum(weights * correction.color(grid, color)) + correction.penalty(grid)
 
         found = jax.jit(jax.grad(value))(jnp.asarray(numbers))
         np.testing.assert_allclose(found, differences(value, numbers), rtol=1e-6, atol=1e-8)
@@ -124,9 +125,11 @@ class TestBilateralGrid:
         neutral = jnp.asarray(correction.neutral, jnp.float32)
         np.testing.assert_allclose(correction.color(neutral, color), color, atol=1e-6)
         assert correction.penalty(neutral) == 0
-        affine = jnp.asarray(RNG.normal(size=(3, 4)), jnp.float32)
+        affine = RNG.normal(size=(3, 4)).astype(np.float32)
         whole = jnp.broadcast_to(affine, neutral.shape)
-        np.testing.assert_allclose(correction.color(whole, color), exposed(affine, color), atol=1e-5)
+        np.testing.assert_allclose(
+            correction.color(whole, color), np.asarray(color) @ affine[:, :3].T + affine[:, 3], atol=1e-5
+        )
 
     def test_on_average_over_the_views_nothing_changes(self):
         correction = BilateralGrid(size=(3, 2, 4))
@@ -142,6 +145,10 @@ class TestBilateralGrid:
         assert grids.shape == (5, 2, 4, 4, 3, 4)
         assert np.abs(grids[: len(scene.train)] - np.eye(3, 4)).max() > 1e-4
         assert all(set(found) == {"exposure"} for found in learned(origin).values())
+
+
+def depth_term(kind="inverse"):
+    return LossConfig(depth_weight=1.0, depth_kind=kind).terms()[-1]
 
 
 class TestDepthPrior:
@@ -167,7 +174,13 @@ class TestDepthPrior:
         def held(images):
             return jnp.sum(jnp.where(counts, jnp.abs(scale * prior + shift - images[1] / images[0]), 0)) / num
 
-        found = jax.jit(jax.grad(lambda images: depth_loss(*images, prior, counts)))(images)
+        def loss(images):
+            depth, alpha = images
+            output = a2tg.RenderOutput(None, alpha, None, Geometry(depth, None, None))
+            target = a2tg.Target(None, None, None, depth_map=jnp.where(counts, prior, jnp.nan))
+            return depth_term()(None, target, output)
+
+        found = jax.jit(jax.grad(loss))(images)
         np.testing.assert_allclose(found, differences(held, images), rtol=1e-6, atol=1e-9)
 
     def test_right_depth_costs_nothing_and_unknown_depth_neither(self):
@@ -176,11 +189,11 @@ class TestDepthPrior:
         output = a2tg.RenderOutput(None, one, None, Geometry(depth, None, None))
         for kind, prior in (("inverse", 3 / depth - 1), ("depth", 7 * depth)):
             target = a2tg.Target(None, None, None, depth_map=prior.at[0].set(jnp.nan))
-            assert DepthPrior(1.0, kind)(None, target, output) < 1e-5
+            assert depth_term(kind)(None, target, output) < 1e-5
         nothing = a2tg.Target(None, None, None, depth_map=jnp.full_like(depth, jnp.nan))
-        assert DepthPrior(1.0)(None, nothing, output) == 0
+        assert depth_term()(None, nothing, output) == 0
         wrong = a2tg.Target(None, None, None, depth_map=depth)
-        assert DepthPrior(1.0)(None, wrong, output) > 0.05
+        assert depth_term()(None, wrong, output) > 0.05
 
     @pytest.mark.long
     def test_a_training_needs_some_and_may_lack_others(self, scene, trained):

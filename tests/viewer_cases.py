@@ -13,10 +13,11 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
+from small_files import model_in
+from small_models import with_bands
 
 from a2tg_jax import (
     Appearance,
-    Bands,
     Camera,
     Exponents,
     Gaussians,
@@ -28,8 +29,6 @@ from a2tg_jax import (
     TextureOptions,
     textures_from_arrays,
 )
-from a2tg_jax.appearance.parts import bands_of_dense
-from a2tg_jax.io.compact import decode_model
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.results.model_source import Source
 
@@ -43,7 +42,8 @@ def small_model(options: TextureOptions = TextureOptions()) -> Model:  # noqa: B
     draw = lambda *shape, scale=1.0: np.asarray(scale * rng.normal(size=shape), np.float32)  # noqa: E731
     sizes = [(0, 0), (1, 1), (2, 3), (4, 1), (5, 5)]
     textures = textures_from_arrays([draw(*sizes[i % 5], 4, scale=0.3) for i in range(NUM)])
-    bands = bands_of_dense(draw(NUM, 16, 3, scale=0.4)[:, 1:], rng.integers(0, 4, NUM), 0)
+    above = draw(NUM, 16, 3, scale=0.4)[:, 1:]
+    degrees = rng.integers(0, 4, NUM)
     gaussians = Gaussians(
         draw(NUM, 3), draw(NUM, 4), draw(NUM, 2, scale=0.5) - np.float32(2), draw(NUM), draw(NUM, 1, 3)
     )  # type: ignore[arg-type]
@@ -51,8 +51,8 @@ def small_model(options: TextureOptions = TextureOptions()) -> Model:  # noqa: B
     viewmat[2, 3] = 4.0
     camera = Camera(viewmat, np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), 64, 48)  # type: ignore[arg-type]
     origin = Origin.of_cameras([camera], ["<b>a</b>.png"])
-    appearance = Appearance(texture=Texture(textures, options=options), bands=Bands(bands))
-    return Model(gaussians, appearance, background=(0.25, 0.5, 0.75), origin=origin)
+    appearance = Appearance(texture=Texture(textures, options=options))
+    return with_bands(Model(gaussians, appearance, background=(0.25, 0.5, 0.75), origin=origin), above, degrees)
 
 
 def shaped_model() -> Model:
@@ -72,7 +72,7 @@ def write_small(folder: Path) -> None:
 
 def small_numbers(model: Model) -> dict[str, list]:
     """What a reader must find in the file, rounded, by row."""
-    model = decode_model(encode_web_scene(model))
+    model = model_in(encode_web_scene(model))
     found = {
         "means": model.gaussians.means,
         "log_scales": model.gaussians.log_scales,
@@ -98,7 +98,7 @@ def write_case(
     folder.mkdir(parents=True)
     (folder / "scene.a2tgz").write_bytes(source.encoded)
     settings = dataclasses.replace(source.settings, near_plane=source.near_plane)
-    models = {"the model": source.model, "the file": decode_model(source.encoded)}
+    models = {"the model": source.model, "the file": model_in(source.encoded)}
     views = []
     for name in of:
         for mode in modes:

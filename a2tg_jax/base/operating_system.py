@@ -4,9 +4,7 @@ import contextlib
 import ctypes
 import functools
 import os
-import signal
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +14,6 @@ M_ARENA_MAX = -8
 """Number of glibc's option for the largest number of heaps, in malloc.h."""
 STACK_BYTES = 8 << 20
 """Usual size of a thread's stack."""
-HANDLER_SIZE = 1024
-"""Bytes for C's struct sigaction, whose size depends on the system; glibc's has 152."""
 
 
 def try_lock(number: int) -> bool:
@@ -57,25 +53,6 @@ def flush_folder(folder: Path) -> None:
         os.close(number)
 
 
-@contextlib.contextmanager
-def signal_handlers_kept() -> Iterator[None]:
-    """Restore the C handlers of all signals after the block, in which a library may replace them; not on Windows.
-
-    `signal.getsignal` does not report such handlers.
-    """
-    sigaction: Any = getattr(_c_library(), "sigaction", None)
-    before = {}
-    for signum in signal.valid_signals() if sigaction else ():
-        handler = ctypes.create_string_buffer(HANDLER_SIZE)
-        if sigaction(int(signum), None, handler) == 0:  # Without a new action it only reads.
-            before[int(signum)] = handler
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            sigaction(number, handler, None)
-
-
 def num_cores() -> int:
     """Return the number of cores that this process may use; on macOS and Windows all cores of the machine."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -83,14 +60,14 @@ def num_cores() -> int:
 
 def trim_heap() -> None:
     """Return the C library's cached free memory to the system. Only glibc has a function for that."""
-    trim = getattr(_c_library(), "malloc_trim", None)
+    trim = getattr(c_library(), "malloc_trim", None)
     if trim is not None:
         trim(0)
 
 
 def keep_one_heap() -> None:
     """Let the threads that start from now on share one heap. glibc reserves 64 MB of address space for each other."""
-    set_option = getattr(_c_library(), "mallopt", None)
+    set_option = getattr(c_library(), "mallopt", None)
     if set_option is not None:
         set_option(M_ARENA_MAX, 1)
 
@@ -115,7 +92,8 @@ def stack_bytes() -> int:
 
 
 @functools.cache
-def _c_library() -> Any:
+def c_library() -> Any:
+    """Return the C library, by ctypes; None if there is none, as on Windows."""
     try:
         return ctypes.CDLL(None)
     except (OSError, TypeError):  # Windows has no such library.

@@ -5,7 +5,7 @@ import sys
 import threading
 from types import ModuleType
 
-from a2tg_jax.base.operating_system import signal_handlers_kept
+from a2tg_jax.host.signals import signal_handlers_kept
 
 _lock = threading.Lock()
 

@@ -36,6 +36,7 @@ from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity, camera_centers
 from a2tg_jax.data.assembly import scene_scale
 from a2tg_jax.finish.shrinking import fewest_texels, texel_weights
+from a2tg_jax.host.training_bar import ProgressBar
 from a2tg_jax.model import Model, plain_gaussians
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.scene import Scene, View
@@ -243,7 +244,7 @@ def distill(
     system = Gaussians2d(stage1_iterations=1, stage2_iterations=iterations, sh_degree=highest, background=behind)
     scene = drawn_scene(wanted, cameras, BACKGROUNDS[behind])
     start = dataclasses.replace(model, origin=None)
-    trained = fit_stage(scene, system, 1, start, progress=Progress(progress, "bake")).model
+    trained = fit_stage(scene, system, 1, start, progress=Progress(ProgressBar if progress else None, "bake")).model
     return dataclasses.replace(trained, origin=wanted.origin)
 
 

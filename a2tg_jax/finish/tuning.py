@@ -36,6 +36,7 @@ from a2tg_jax.finish.compaction import (
     smallest_within,
     trial_of,
 )
+from a2tg_jax.host.training_bar import ProgressBar
 from a2tg_jax.io.columns import LEAST_OPACITY
 from a2tg_jax.io.compact import CompactChoices, Grids, encode_model, grids_of, half_turned
 from a2tg_jax.io.model_rows import check_encodable
@@ -312,7 +313,7 @@ def tune_compact(
     # Tuning changes no sizes, so no budget applies.
     shared |= {"memory_budget": None, "initial_gaussians": None, "sh_degree": start.gaussians.sh_degree}
     one_stage = _OneStage(**shared, stage=tuning)
-    tuned = fit_stage(scene, one_stage, 0, start, progress=Progress(progress, title)).model
+    tuned = fit_stage(scene, one_stage, 0, start, progress=Progress(ProgressBar if progress else None, title)).model
     return Tuned(dataclasses.replace(tuned, origin=start.origin), choices, grids)
 
 

@@ -5,11 +5,17 @@ of them. A signal whose exception was ignored is therefore sent again.
 """
 
 import contextlib
+import ctypes
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
 from typing import Any
+
+from a2tg_jax.base.operating_system import c_library
+
+HANDLER_SIZE = 1024
+"""Bytes for C's struct sigaction, whose size depends on the system; glibc's has 152."""
 
 CTRL_C = signal.SIGINT
 ENDING = (CTRL_C, *(getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGUSR1") if hasattr(signal, name)))
@@ -53,11 +59,22 @@ def raised() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def noted(numbers: tuple[int, ...] = ENDING) -> Iterator[Callable[[], bool]]:
-    """Note the first signal within the block, and raise `Stopped` at the second, or else at the end of the block.
+def stop_on_signals(numbers: tuple[int, ...] = ENDING) -> Iterator[Callable[[], bool]]:
+    """Note the first Ctrl-C, SIGTERM, SIGHUP or SIGUSR1 within the block, for training that stops after a step.
 
-    Yield a function that returns whether there was a signal. Programs that handle a signal themselves keep their
-    handler.
+    A second signal raises KeyboardInterrupt at once; after a single one, it is raised at the end of the block. Programs
+    that handle a signal themselves keep their handler.
+
+    Args:
+      numbers: the signals.
+
+    Returns:
+      A context of a function that returns whether there was a signal, the `is_stopped` of `fit`.
+
+    Examples:
+      >>> system = a2tg.Gaussians2dMcmc.preset("smoke", stage1_iterations=20)
+      >>> with a2tg.stop_on_signals() as is_stopped:
+      ...     result = a2tg.fit(scene, system, is_stopped=is_stopped)
     """
     received: list[int] = []
 
@@ -119,3 +136,22 @@ def _handled_by(handler: Callable[..., object], numbers: tuple[int, ...]) -> Ite
         sys.unraisablehook = ignored
         for number, old in before.items():
             signal.signal(number, old)  # type: ignore[arg-type]
+
+
+@contextlib.contextmanager
+def signal_handlers_kept() -> Iterator[None]:
+    """Restore the C handlers of all signals after the block, in which a library may replace them; not on Windows.
+
+    `signal.getsignal` does not report such handlers.
+    """
+    sigaction: Any = getattr(c_library(), "sigaction", None)
+    before = {}
+    for signum in signal.valid_signals() if sigaction else ():
+        handler = ctypes.create_string_buffer(HANDLER_SIZE)
+        if sigaction(int(signum), None, handler) == 0:  # Without a new action it only reads.
+            before[int(signum)] = handler
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            sigaction(number, handler, None)

@@ -88,7 +88,7 @@ def follow_first_process(record: RunRecord, scene: Scene, session: Session) -> N
     check_alike(record, scene, session)
     plan = record.plan
     # The first process reports warnings; the others would only repeat them.
-    with warnings.catch_warnings(), signals.noted() as is_stopped, tempfile.TemporaryDirectory() as folder:
+    with warnings.catch_warnings(), signals.stop_on_signals() as is_stopped, tempfile.TemporaryDirectory() as folder:
         warnings.simplefilter("ignore")
         while True:
             header = json.loads(broadcast(b""))
@@ -111,7 +111,6 @@ def follow_first_process(record: RunRecord, scene: Scene, session: Session) -> N
                     resume=resume,
                     on_checkpoint=lambda checkpoint: None,
                     checkpoint_every=planned.checkpoint_every,
-                    progress=False,
                     is_stopped=is_stopped,
                     num_restored=header["num_restored"],
                     session=session,

@@ -12,6 +12,7 @@ from a2tg_jax.base.machine import Devices
 from a2tg_jax.finish.tuning import ITERATIONS
 from a2tg_jax.host import signals
 from a2tg_jax.host.errors import error_text
+from a2tg_jax.host.training_bar import ProgressBar
 from a2tg_jax.io.formats import load_splats
 from a2tg_jax.model_file import number_in_file, save_model
 from a2tg_jax.results.commands import file_command, resuming_command
@@ -138,7 +139,7 @@ def _train_and_measure(run: RunFolder, record: RunRecord, scene: Scene, options:
     replaced run is restored if there is no checkpoint yet."""
     try:
         check_alike(record, scene, options.session)
-        with signals.noted() as is_stopped, options.watched(scene) as options.session.watch:
+        with signals.stop_on_signals() as is_stopped, options.watched(scene) as options.session.watch:
             train_run(run, scene, options, is_stopped=is_stopped)
         leave_others()
         result = evaluate_run(run, scene, lpips_weights=options.lpips_weights)
@@ -218,7 +219,7 @@ def train_run(run: RunFolder, scene: Scene, options: RunOptions, *, is_stopped: 
             check_finished(path, planned)
         else:
             events = EventWriter(run, name) if options.tensorboard else None
-            bar = Progress(options.progress, name, after[name])
+            bar = Progress(ProgressBar if options.progress else None, name, after[name])
             fit_this = functools.partial(fit, progress=bar, checkpoint_every=planned.checkpoint_every)
             result = _train_stage(run, planned, scene, fit_this, events, record.on_nan)
             if events is not None:

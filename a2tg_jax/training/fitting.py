@@ -14,8 +14,6 @@ from a2tg_jax.core.budget import LARGEST_SHORTFALL
 from a2tg_jax.core.checks import check_kind, check_untraced, kind_of
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.named_fields import NamedFields
-from a2tg_jax.data.synthetic import BUILT_IN
-from a2tg_jax.host import signals
 from a2tg_jax.model import Model
 from a2tg_jax.scene import Scene, check_scene, origin_of_scene
 from a2tg_jax.training.checkpoint import Checkpoint, History
@@ -23,7 +21,7 @@ from a2tg_jax.training.corrections import corrected_origin
 from a2tg_jax.training.cost import check_rows_fit
 from a2tg_jax.training.loop import IsStopped, OnCheckpoint, OnLog, Session, StageRun, never
 from a2tg_jax.training.options import System
-from a2tg_jax.training.reports import Progress
+from a2tg_jax.training.reports import Display, Progress
 from a2tg_jax.training.stage import BACKGROUNDS
 from a2tg_jax.training.start import checked_start
 
@@ -78,7 +76,7 @@ class FitResult(NamedFields):
 
         Examples:
           >>> system = a2tg.Gaussians2dMcmc.preset("smoke", stage1_iterations=20)
-          >>> result = a2tg.fit(scene, system, progress=False).more(scene, 10, progress=False)
+          >>> result = a2tg.fit(scene, system).more(scene, 10)
           >>> [stage.name for stage in result.stages]
           ['gaussians', 'more']
         """
@@ -126,7 +124,7 @@ def fit(
     on_checkpoint: OnCheckpoint | None = None,
     checkpoint_every: int | None = None,
     on_log: OnLog | None = None,
-    progress: bool = True,
+    progress: type[Display] | None = None,
     is_stopped: IsStopped = never,
     session: Session | None = None,
     max_memory: int | None = None,
@@ -146,9 +144,9 @@ def fit(
       checkpoint_every: None: at the end of each stage only.
       on_log: called with each new row of the history, every 10 iterations: a dictionary of numbers, with the names of
         the columns of `History.to_dict`.
-      progress: show a progress bar.
+      progress: class that shows the progress, such as `ProgressBar`; None: it is not shown.
       is_stopped: called between steps and after the last. If it returns True, `on_checkpoint` is called once more and
-        `Interrupted` is raised. The first Ctrl-C does the same, unless the program handles it.
+        `Interrupted` is raised. `stop_on_signals` gives one for Ctrl-C.
       session: what trainings of this process share, compiled shapes and devices; None: a new one.
       max_memory: bytes that the parameters, gradients and moments of all rows may take; None: what the machine or the
         GPU has available. Training that needs more is refused before it begins.
@@ -164,7 +162,7 @@ def fit(
 
     Examples:
       >>> system = a2tg.Gaussians2dMcmc.preset("smoke", stage1_iterations=20)
-      >>> result = a2tg.fit(scene, system, progress=False)
+      >>> result = a2tg.fit(scene, system)
       >>> result.model.render(camera).color.shape
       (36, 48, 3)
       >>> result.history.iteration
@@ -185,18 +183,13 @@ def fit(
     if resume is None:
         check_rows_fit(scene, system, first, None if start is None else start.num, session.devices, max_memory)
     results: list[StageResult] = []
-    with signals.noted((signals.CTRL_C,)) as is_interrupted:
-
-        def stops() -> bool:
-            return is_interrupted() or is_stopped()
-
-        for index in range(first, len(stages)):
-            run = StageRun(scene, system, index, start, resume, session=session)
-            run.train(on_checkpoint, checkpoint_every, on_log, Progress(progress), stops)
-            is_last = index == len(stages) - 1
-            results.append(_result_of(run, scene, is_last=is_last))
-            start = results[-1].model
-            resume = run.checkpoint if is_last or stages[index + 1].continues else None
+    for index in range(first, len(stages)):
+        run = StageRun(scene, system, index, start, resume, session=session)
+        run.train(on_checkpoint, checkpoint_every, on_log, Progress(progress), is_stopped)
+        is_last = index == len(stages) - 1
+        results.append(_result_of(run, scene, is_last=is_last))
+        start = results[-1].model
+        resume = run.checkpoint if is_last or stages[index + 1].continues else None
     assert resume is not None
     # In the memory of the host, so that further trainings have the memory of the GPU.
     return FitResult(system, tuple(results), dataclasses.replace(resume, state=jax.tree.map(np.asarray, resume.state)))
@@ -208,11 +201,7 @@ def _check_arguments(
     """Raise ValueError unless the arguments are of their classes, and the training views and the options are valid."""
     check_untraced("fit")
     is_path = str, os.PathLike
-    example = ""
-    if isinstance(scene, is_path):
-        path = os.fspath(scene)
-        example = f"use {path}_scene()" if path in BUILT_IN else f"use load_scene({path!r})"
-    check_kind("scene", scene, Scene, example)
+    check_kind("scene", scene, Scene, f"use load_scene({os.fspath(scene)!r})" if isinstance(scene, is_path) else "")
     if not isinstance(system, System):
         kind = kind_of(system)
         example = ""
@@ -252,7 +241,7 @@ def fit_stage(
     on_checkpoint: OnCheckpoint | None = None,
     checkpoint_every: int | None = None,
     on_log: OnLog | None = None,
-    progress: bool | Progress = True,
+    progress: type[Display] | Progress | None = None,
     is_stopped: IsStopped = never,
     session: Session | None = None,
     max_memory: int | None = None,
@@ -270,7 +259,7 @@ def fit_stage(
       on_checkpoint: as in `fit`.
       checkpoint_every: as in `fit`.
       on_log: as in `fit`.
-      progress: show a progress bar; or its title, and what follows the stage.
+      progress: as in `fit`; or with a title, and what follows the stage.
       is_stopped: as in `fit`.
       session: as in `fit`.
       max_memory: as in `fit`.
@@ -283,7 +272,7 @@ def fit_stage(
 
     Examples:
       >>> system = a2tg.Gaussians2dMcmc.preset("smoke", stage1_iterations=20)
-      >>> result = a2tg.fit_stage(scene, system, 0, progress=False)
+      >>> result = a2tg.fit_stage(scene, system, 0)
       >>> len(result.history.psnr)
       2
     """

@@ -31,7 +31,7 @@ from a2tg_jax.training.checkpoint import COLUMNS, TERM, Checkpoint, History, Int
 from a2tg_jax.training.divergence import DivergedError, largest_loss, what_diverged
 from a2tg_jax.training.options import System
 from a2tg_jax.training.recorded_views import RecordedViews
-from a2tg_jax.training.reports import LearningCheck, Progress, ProgressBar, StageEffects
+from a2tg_jax.training.reports import Display, LearningCheck, Pace, Progress, StageEffects
 from a2tg_jax.training.returned import calling, checked_change
 from a2tg_jax.training.stage import BACKGROUNDS
 from a2tg_jax.training.start import state_of_checkpoint, state_of_start
@@ -233,8 +233,10 @@ class StageRun:
         self.effects.warn_of_never()
         # Several processes launch the same steps, and stop together.
         stops_launching = is_stopped if num_processes(self.mesh) == 1 else never
-        bar = ProgressBar(progress, self.stage, iteration)
-        with contextlib.closing(self.photographs), bar:
+        most = max((event.most_gaussians or 0 for event in self.stage.events), default=0)
+        pace = Pace(iteration, end, most_gaussians=most, after=progress.after)
+        display = (progress.display or Display)(progress.title or self.stage.name, iteration, end)
+        with contextlib.closing(self.photographs), display:
             while iteration < end:
                 # Python acts after `launched` steps, and at events and checkpoints.
                 stops = [iteration + self.launched - iteration % self.launched, end]
@@ -247,10 +249,15 @@ class StageRun:
                     if iteration % LOG_EVERY == 0 or iteration == end:
                         self._log(iteration, info, on_log)
                     self.learning.observe(iteration, float(info.psnr))
-                    bar.update(info, self._rows[-1] if self._rows else None)
+                    row = self._rows[-1] if self._rows else None
+                    display.update(float(info.loss), float(info.psnr), row, pace.left(iteration))
                 effects = self.effects
                 ahead = effects.programs_ahead(iteration)
-                self.time_left = bar.tell_pace(iteration, effects.num_compiled, ahead, effects.seconds_a_program)
+                pace.time(iteration, effects.num_compiled, ahead, effects.seconds_a_program)
+                forecast = pace.told(iteration)
+                if forecast is not None:
+                    display.tell(forecast)
+                self.time_left = pace.left(iteration)
                 # `iteration` is less if a step could not be taken or training is being stopped.
                 if iteration == stop:
                     self._host_events(iteration)

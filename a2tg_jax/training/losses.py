@@ -14,6 +14,7 @@ from a2tg_jax.core.cameras import Camera, back_project, check_is_camera
 from a2tg_jax.core.checks import check_array, check_floats, check_number, check_shape, plain_array
 from a2tg_jax.core.numerics import normalize, safe_divide
 from a2tg_jax.rasterize.kernels import window_scores
+from a2tg_jax.rasterize.kernels.score import Score
 
 SSIM_SIGMA = 1.5
 SSIM_RADIUS = 5
@@ -80,7 +81,7 @@ def mean_ssim(image: Array, target: Array) -> Array:
         )
     x = jnp.moveaxis(image, -1, 0)
     y = jnp.moveaxis(target, -1, 0)
-    return window_scores.mean_score(window_scores.Score(_similarity, SSIM_TAPS), x, y)
+    return window_scores.mean_score(Score(_similarity, SSIM_TAPS), x, y)
 
 
 def _similarity(mean_x: Array, mean_y: Array, mean_squares: Array, mean_product: Array) -> Array:

@@ -6,33 +6,28 @@ You are warned of events that do nothing or compile too often, and if training d
 import collections
 import dataclasses
 import datetime
-import sys
 import time
 import warnings
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.base.text import counted, in_bytes
+from a2tg_jax.base.text import counted
 from a2tg_jax.events import Change, HostEvent, Times
-from a2tg_jax.host.progress_bars import has_terminal, is_line_due, new_bar
 from a2tg_jax.scene import View, view_image
 from a2tg_jax.training.batches import BatchOrder
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Background, Stage
-from a2tg_jax.training.step import StepInfo, TrainState
+from a2tg_jax.training.step import TrainState
 
-MOMENTUM = 0.95
 TIMED_SECONDS = 2.0
 """Least time of the steps from which a duration is forecast."""
 TIMED_STEPS = 3
 """Least number of these steps."""
-BAR = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]"
-"""tqdm's format without its rate and remaining time, which count compilation."""
 
 
 class RestOfRun(NamedTuple):
@@ -44,11 +39,43 @@ class RestOfRun(NamedTuple):
     """Number of programs to compile."""
 
 
-class Progress(NamedTuple):
-    """Progress bar of a stage."""
+class Display:
+    """A display of a stage's progress, which shows nothing. Subclasses show it, such as `ProgressBar`."""
 
-    is_shown: bool = True
-    """False: there is none."""
+    def __init__(self, title: str, done: int, total: int):
+        """Args:
+        title: name of the stage.
+        done: number of iterations that were done before.
+        total: number of all iterations.
+        """
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End the display."""
+
+    def update(
+        self, loss: float, psnr: float, row: Mapping[str, float] | None, left: datetime.timedelta | None
+    ) -> None:
+        """Count one iteration.
+
+        Args:
+          loss: its loss.
+          psnr: its training PSNR in dB.
+          row: last row of the history; None: there is none yet.
+          left: remaining time of the run; None: it is not known yet.
+        """
+
+    def tell(self, text: str) -> None:
+        """Show a forecast of the remaining time in words, which is made twice in a stage."""
+
+
+class Progress(NamedTuple):
+    """How the progress of a stage is shown."""
+
+    display: type[Display] | None = None
+    """Class of the display; None: it is not shown."""
     title: str | None = None
     """Its title; None: the stage's name."""
     after: RestOfRun = RestOfRun()
@@ -109,78 +136,6 @@ class Pace:
         of_steps = (self._total - done + self._after.iterations) * self._seconds / self._steps
         programs = self._ahead + self._after.programs
         return datetime.timedelta(seconds=round(of_steps + programs * self._seconds_a_program))
-
-
-class ProgressBar:
-    """A line with loss, PSNR, live Gaussians, memory and time left; a line for every tenth without a terminal."""
-
-    def __init__(self, progress: Progress, stage: Stage, done: int):
-        """`done` iterations of the stage were done before."""
-        title = progress.title or stage.name
-        total = stage.iterations
-        is_bar = progress.is_shown and has_terminal()
-        self._bar = new_bar(
-            desc=f"{title} (compiling)", initial=done, total=total, disable=not is_bar, unit="it",
-            dynamic_ncols=True, mininterval=0.5, bar_format=BAR,
-        )  # fmt: skip
-        self._title = title
-        self._done = done
-        self._total = total
-        most = max((event.most_gaussians or 0 for event in stage.events), default=0)
-        self._pace = Pace(done, total, most_gaussians=most, after=progress.after)
-        self._is_shown = progress.is_shown
-        self._is_plain = progress.is_shown and not is_bar
-        self._last_line = done, time.perf_counter()
-        self._loss: float | None = None
-        self._psnr = 0.0
-        if self._is_plain:
-            self._print("compiling")
-
-    def __enter__(self) -> "ProgressBar":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.close()
-
-    def tell_pace(
-        self, done: int, num_compiled: int, ahead: int = 0, seconds_a_program: float = 0.0
-    ) -> datetime.timedelta | None:
-        """Print a forecast if one is due, after steps that were launched together, and return the remaining time of the
-        run (`Pace.left`). Arguments as `Pace.time`."""
-        self._pace.time(done, num_compiled, ahead, seconds_a_program)
-        forecast = self._pace.told(done)
-        if forecast is not None and self._is_shown:
-            self._bar.write(f"{self._title}: {forecast}")
-        return self._pace.left(done)
-
-    def update(self, info: StepInfo, row: Mapping[str, float] | None) -> None:
-        """Count one iteration; loss and PSNR are running means. `row` is the last one of the history."""
-        loss = float(info.loss)
-        psnr = float(info.psnr)
-        if self._loss is None:
-            self._loss = loss
-            self._psnr = psnr
-            self._bar.set_description_str(self._title)
-        self._loss += (1 - MOMENTUM) * (loss - self._loss)
-        self._psnr += (1 - MOMENTUM) * (psnr - self._psnr)
-        self._done += 1
-        self._bar.update()
-        if row and not self._bar.disable:
-            self._bar.set_postfix_str(self._figures(row), refresh=False)
-        if self._is_plain and is_line_due(self._done, self._total, *self._last_line):
-            self._print(f"{self._done:,} of {self._total:,}, {self._figures(row)}")
-
-    def _figures(self, row: Mapping[str, float] | None) -> str:
-        left = self._pace.left(self._done)
-        words = [] if not left or self._done == self._total else [f"{left} left"]
-        words.append(f"loss {self._loss:.4f}, {self._psnr:.2f} dB")
-        if row:
-            words.append(f"{row['num_gaussians']:,} Gaussians, {in_bytes(1e6 * row['megabytes'])}")
-        return ", ".join(words)
-
-    def _print(self, text: str) -> None:
-        print(f"{self._title}: {text}", file=sys.stderr, flush=True)
-        self._last_line = self._done, time.perf_counter()
 
 
 CHECKED_AFTER = 0.2

@@ -252,7 +252,6 @@ def _train(job: Job, folders: Folders, scene: a2tg.Scene, stop_at: float) -> tup
                 *stage,
                 **options,
                 checkpoint_every=max(500, job.iterations // 10),
-                progress=False,
                 is_stopped=lambda: time.monotonic() >= stop_at,
                 session=_session(),
             )

@@ -8,7 +8,7 @@ import functools
 import importlib
 import operator
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,14 +18,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from a2tg_jax.rasterize.kernels.platforms import by_platform, is_available
-
-
-class Score(NamedTuple):
-    """Score to average over windows; hashable."""
-
-    function: Callable[[Array, Array, Array, Array], Array]
-    """Element-wise function of the means of x, y, x² + y² and x·y."""
-    taps: tuple[float, ...]  # weights of a window along one axis, symmetric
+from a2tg_jax.rasterize.kernels.score import Score
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))

@@ -27,7 +27,7 @@ from a2tg_jax.rasterize.kernels.jaxprs import example, trace
 from a2tg_jax.rasterize.kernels.native import ffi, llvm_code
 from a2tg_jax.rasterize.kernels.native.lanes import Lanes
 from a2tg_jax.rasterize.kernels.native.llvm_code import INT, LONG, CompiledFunction, Writer
-from a2tg_jax.rasterize.kernels.window_scores import Score
+from a2tg_jax.rasterize.kernels.score import Score
 
 SCORE = ("x", "y", "sums", "d_means", "rows")
 PULL_BACK = ("x", "y", "d_mean", "d_squares", "d_product", "share", "d_x", "rows")
