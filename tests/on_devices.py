@@ -23,7 +23,6 @@ from a2tg_jax.core.config_json import changed_config
 from a2tg_jax.parallel import whole
 from a2tg_jax.training import loop
 from a2tg_jax.training.batches import PhotoStore
-from a2tg_jax.training.cost import stage_bytes
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.start import initial_model, padded
 from a2tg_jax.training.step import attempt, jitted_step
@@ -241,7 +240,7 @@ def shared(folder):
 
 
 def memory(folder):
-    """A device has its share of parameters and moments; the forecast of a step is what XLA says of it."""
+    """A device has its share of parameters and moments."""
     found = a2tg.synthetic_scene(num_views=5, width=48, height=36, num_points=4000)
     own = system(Gaussians2dMcmc, densify={"cap": 4000}, initial_gaussians=4000)
     run = StageRun(found, own, 0, initial_model(found, own), session=devices(4))
@@ -250,8 +249,6 @@ def memory(folder):
     model_bytes = run.model.num_bytes
     rest = sum(leaf.nbytes for leaf in jax.tree.leaves(arguments[4]))
     assert said.argument_size_in_bytes < 3 * model_bytes / 4 + rest + 10_000
-    expected = stage_bytes(found, own, run.stage, 4000, model_bytes, 4)
-    assert 0.75 < (expected.gradients + expected.pixels) / (4 * said.temp_size_in_bytes) < 1.33, (expected, said)
     run.photographs.close()
 
 

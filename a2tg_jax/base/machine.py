@@ -141,6 +141,12 @@ def allowed_memory(max_memory: int | None, num_devices: int = 1) -> int:
     return num_devices * stats.get("bytes_limit", 0) or memory_limit()
 
 
+def used_memory(num_devices: int = 1) -> int:
+    """Return the bytes in use now: of the accelerators, if each uses as much as the default one, or of this process."""
+    stats = default_device().memory_stats() or {}
+    return num_devices * stats.get("bytes_in_use", 0) or int(psutil.Process().memory_info().rss)
+
+
 @functools.cache
 def check_ulimits() -> None:
     """Check `ulimit` before JAX starts, which would end the process without a message.

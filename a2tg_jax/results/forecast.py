@@ -1,4 +1,4 @@
-"""Forecast of a run's memory and disk space, and errors for runs that cannot fit."""
+"""What a run needs at least of memory and disk, before anything is compiled, and errors for runs that cannot fit."""
 
 import dataclasses
 import math
@@ -6,37 +6,19 @@ import os
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
-from a2tg_jax.base.machine import allowed_memory, default_platform
+from a2tg_jax.base.machine import allowed_memory, default_platform, used_memory
 from a2tg_jax.base.text import in_bytes
 from a2tg_jax.data.photo_store import SHARE_OF_MEMORY
 from a2tg_jax.results.commands import QUICK_SIDE, quick_flags
 from a2tg_jax.results.plan import RunPlan
 from a2tg_jax.results.record import MEMORY_OF_FILE, RunRecord
 from a2tg_jax.scene import Scene, View
-from a2tg_jax.training.cost import (
-    COMPILER,
-    FIRST_PROGRAM,
-    FURTHER_PROGRAM,
-    FURTHER_STAGE,
-    MB,
-    PROCESS,
-    STATES,
-    Bytes,
-    StageForecast,
-    forecast_stages,
-    held_bytes,
-    largest_view,
-)
+from a2tg_jax.training.cost import STATES, StageForecast, fed_bytes, forecast_stages, held_bytes
 from a2tg_jax.training.options import SENSIBLE_GAUSSIANS
 from a2tg_jax.training.reports import RestOfRun
 
-REPORT = 290 * MB
-"""Bytes of programs and imports for evaluation, figures and the report."""
-EVALUATION_PER_PIXEL = 150
-"""Bytes per pixel for rendering, comparing and drawing a view, with depth and normals."""
-DRAWN_SHARE = 1.0
-"""Time of drawing, comparing and reporting a view of a model, as a share of an iteration."""
 KEPT_STATES = 3
 """Number of checkpoints on disk while a new one is written."""
 PICTURE_PER_PIXEL = 2
@@ -48,19 +30,30 @@ SMALL_SIDE = 100
 OPTIONS = {
     "photographs": ("downscale", "batch_size"),
     "model": ("memory_budget", "sh_degree"),
-    "gradients": ("memory_budget", "batch_size", "sh_degree"),
-    "pixels": ("downscale",),
-    "corrections": ("corrections.grid.size", "downscale"),
 }
 """Options to change, by the largest part of the memory; limits of the number of Gaussians precede them."""
 
 
+class Bytes(NamedTuple):
+    """Bytes in memory at one time, by purpose."""
+
+    program: float = 0
+    """The program and its libraries; 0 on accelerators."""
+    photographs: float = 0
+    model: float = 0
+    """Parameters, gradients and moments."""
+
+    @property
+    def total(self) -> float:
+        return sum(self)
+
+
 @dataclasses.dataclass(frozen=True)
 class RunForecast:
-    """Estimate of what a run will take."""
+    """What a run needs at least. Renders and compiled programs come on top: XLA says how much before a stage begins."""
 
     phases: Mapping[str, Bytes]
-    """Memory at the peak of each stage, by name, and of the evaluation."""
+    """Memory of each stage, by name."""
     disk_bytes: float
     """Bytes in the run folder."""
     limits: tuple[str, ...] = ()
@@ -77,8 +70,8 @@ class RunForecast:
         """Return the forecast as lines of text."""
         phase, needed = self.peak
         return (
-            f"memory: about {in_bytes(needed.total)} at the peak ({phase}: {_parts(needed)}); {in_bytes(limit)} may be "
-            f"used\ndisk: about {in_bytes(self.disk_bytes)} in the run folder"
+            f"memory: at least {in_bytes(needed.total)} ({phase}: {_parts(needed)}); {in_bytes(limit)} may be used\n"
+            f"disk: about {in_bytes(self.disk_bytes)} in the run folder"
         )
 
     def check_memory(self, limit: float) -> None:
@@ -93,7 +86,7 @@ class RunForecast:
         else:
             advice = f"change {self._options(largest)}, or"
         raise ValueError(
-            f"the run would need about {in_bytes(needed.total)} of memory ({phase}: {_parts(needed)}), and "
+            f"the run would need at least {in_bytes(needed.total)} of memory ({phase}: {_parts(needed)}), and "
             f"{in_bytes(limit)} may be used: {advice} allow more with `max_memory`"
         )
 
@@ -119,34 +112,28 @@ class RunForecast:
 
     def _options(self, largest: str) -> str:
         """Return the options to change if this part of the memory is the largest."""
-        limits = self.limits if largest in ("model", "gradients") else ()
+        limits = self.limits if largest == "model" else ()
         *others, last = dict.fromkeys(f"`{name}`" for name in (*limits, *OPTIONS[largest]))
         return f"{', '.join(others)} or {last}" if others else last
 
 
 def forecast_run(scene: Scene, plan: RunPlan, num_given: int | None = None, num_devices: int = 1) -> RunForecast:
-    """Return a forecast of a run's memory and disk space (host; nothing is compiled). `num_given` is the number of
-    Gaussians of the file that replaces the main system's first stage; memory is the sum over all devices."""
+    """Return what a run needs at least of memory and disk space (host; nothing is compiled). `num_given` is the number
+    of Gaussians of the file that replaces the main system's first stage; memory is the sum over all devices."""
     # On accelerators programs and photographs take the host's memory, not the device's.
     is_host = default_platform() == "cpu"
+    held = held_bytes(scene)
+    program = max(0, used_memory() - held) if is_host else 0
+    # Each of several devices draws with a copy of the model, and has gradients of all rows.
+    copies = STATES + (2 * num_devices if num_devices > 1 else 1)
     stages = _forecasts(scene, plan, num_given, num_devices)
-    # Compiled programs stay in memory, so each stage adds to the ones before.
-    resident = PROCESS + FIRST_PROGRAM - FURTHER_STAGE
     phases = {}
     for name, stage in stages.items():
         if stage.is_trained:
-            resident += FURTHER_STAGE + FURTHER_PROGRAM * (stage.num_programs - 1)
-            # Compilation ends before gradients and pixels take memory: the larger of both counts.
-            compiling = max(COMPILER - stage.bytes.gradients - stage.bytes.pixels, 0)
-            phases[name] = stage.bytes._replace(program=(resident + compiling) if is_host else 0)
+            batch = plan[name].system.batch_size // num_devices
+            fed = fed_bytes(scene.train, batch, has_depths=plan[name].stage.has_depths)
+            phases[name] = Bytes(program, is_host * held + num_devices * fed, copies * stage.model_bytes)
     model_bytes = [stage.model_bytes for stage in stages.values()]
-    phases["evaluation"] = Bytes(
-        program=(resident + REPORT) if is_host else 0,
-        photographs=held_bytes(scene) if is_host else 0,
-        # Evaluation holds all models at once.
-        model=sum(model_bytes),
-        pixels=EVALUATION_PER_PIXEL * largest_view((*scene.test, *scene.train)),
-    )
     # Models stay, the states that can be continued, checkpoints of one stage at a time, and sheets of photograph,
     # renders and error. The last stage's state is one of its checkpoints.
     kept = sum(stages[name].model_bytes for name in plan.kept_states[:-1])
@@ -182,14 +169,15 @@ def time_after(
     """Return what follows each of the stages that are to be trained: others, the run's evaluation, and `num_tuning`
     iterations that tune a file. `num_given` as in `forecast_run`."""
     stages = _forecasts(scene, plan, num_given, 1)
-    drawn = DRAWN_SHARE * len(plan.names) * (len(scene.train) + len(scene.test))
+    num_drawn = len(plan.names) * (len(scene.train) + len(scene.test))
     rests = {}
     for index, name in enumerate(names):
-        seconds_per_iteration = stages[name].seconds / plan[name].stage.iterations
-        later = [stages[other] for other in names[index + 1 :]]
-        iterations = sum(stage.seconds for stage in later) / seconds_per_iteration
-        num_programs = sum(stage.num_programs for stage in later) + len(plan.names)
-        rests[name] = RestOfRun(iterations + drawn + num_tuning, num_programs)
+        later = names[index + 1 :]
+        # An iteration of a later stage is taken to last as long as one of this stage, and so is the drawing of a view.
+        iterations = sum(plan[other].stage.iterations for other in later)
+        num_programs = sum(stages[other].num_programs for other in later) + len(plan.names)
+        largest = max((stages[other].model_bytes for other in later), default=0)
+        rests[name] = RestOfRun(iterations + num_drawn + num_tuning, num_programs, largest)
     return rests
 
 
@@ -268,6 +256,5 @@ def room_for_photographs(max_memory: int | None) -> int | None:
 
 
 def _parts(needed: Bytes) -> str:
-    """Return the parts of the memory in words; corrections only if there are any."""
-    parts = needed._asdict()
-    return ", ".join(f"{name} {in_bytes(size)}" for name, size in parts.items() if size or name != "corrections")
+    """Return the parts of the memory in words."""
+    return ", ".join(f"{name} {in_bytes(size)}" for name, size in needed._asdict().items())

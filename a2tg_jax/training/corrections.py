@@ -31,8 +31,6 @@ class Correction(NamedFields):
 
     name: ClassVar[str]
     """Name, unique in its stage; files use it for the rows."""
-    bytes_per_pixel: ClassVar[float] = 0
-    """Bytes of a step's own buffers for each pixel, gradients included, for forecasts."""
 
     def check_options(self) -> None:
         """Check the ranges of the fields (host). A stage calls it.
@@ -309,7 +307,6 @@ class BilateralGrid(FadingCorrection):
 
     name = "bilateral_grid"
     averages_neutral = True
-    bytes_per_pixel = 89  # as XLA reports for the gradient of `sliced`
 
     def check_options(self) -> None:
         super().check_options()

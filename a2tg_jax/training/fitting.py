@@ -21,7 +21,7 @@ from a2tg_jax.training.corrections import corrected_origin
 from a2tg_jax.training.cost import check_rows_fit
 from a2tg_jax.training.loop import IsStopped, OnCheckpoint, OnLog, Session, StageRun, never
 from a2tg_jax.training.options import System
-from a2tg_jax.training.reports import Display, Progress
+from a2tg_jax.training.reports import Display, Progress, RestOfRun
 from a2tg_jax.training.stage import BACKGROUNDS
 from a2tg_jax.training.start import checked_start
 
@@ -148,8 +148,9 @@ def fit(
       is_stopped: called between steps and after the last. If it returns True, `on_checkpoint` is called once more and
         `Interrupted` is raised. `stop_on_signals` gives one for Ctrl-C.
       session: what trainings of this process share, compiled shapes and devices; None: a new one.
-      max_memory: bytes that the parameters, gradients and moments of all rows may take; None: what the machine or the
-        GPU has available. Training that needs more is refused before it begins.
+      max_memory: bytes of memory that may be in use, of the process or of the GPU; None: what the machine or the GPU
+        has available. Training is refused before it begins if parameters, gradients and moments alone take more, and
+        before its first step if XLA reports more for that, or a later stage would take more.
 
     Returns:
       The trained model, `result.model`, and what its stages logged.
@@ -180,12 +181,14 @@ def fit(
             first += 1
     session = session or Session()
     start = checked_start(scene, system, first, start, resume, len(stages))
+    sizes: list[float] = []
     if resume is None:
-        check_rows_fit(scene, system, first, None if start is None else start.num, session.devices, max_memory)
+        sizes = check_rows_fit(scene, system, first, None if start is None else start.num, session.devices, max_memory)
     results: list[StageResult] = []
     for index in range(first, len(stages)):
-        run = StageRun(scene, system, index, start, resume, session=session)
-        run.train(on_checkpoint, checkpoint_every, on_log, Progress(progress), is_stopped)
+        run = StageRun(scene, system, index, start, resume, session=session, max_memory=max_memory)
+        after = RestOfRun(model_bytes=max(sizes[index + 1 :], default=0))
+        run.train(on_checkpoint, checkpoint_every, on_log, Progress(progress, after=after), is_stopped)
         is_last = index == len(stages) - 1
         results.append(_result_of(run, scene, is_last=is_last))
         start = results[-1].model
@@ -284,7 +287,7 @@ def fit_stage(
     start = checked_start(scene, system, index, start, resume)
     if resume is None:
         check_rows_fit(scene, system, index, None if start is None else start.num, session.devices, max_memory)
-    run = StageRun(scene, system, index, start, resume, num_restored, session)
+    run = StageRun(scene, system, index, start, resume, num_restored, session, max_memory)
     bar = progress if isinstance(progress, Progress) else Progress(progress)
     run.train(on_checkpoint, checkpoint_every, on_log, bar, is_stopped)
     return _result_of(run, scene, is_last=index == len(stages) - 1)

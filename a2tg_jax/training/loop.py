@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.base.machine import Devices
+from a2tg_jax.base.text import in_bytes
 from a2tg_jax.core.compilations import compilations
 from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.table import Shape
@@ -28,6 +29,7 @@ from a2tg_jax.rasterize.room import TileRoom, most_pairs
 from a2tg_jax.scene import Scene
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.checkpoint import COLUMNS, TERM, Checkpoint, History, Interrupted
+from a2tg_jax.training.cost import check_step_fits
 from a2tg_jax.training.divergence import DivergedError, largest_loss, what_diverged
 from a2tg_jax.training.options import System
 from a2tg_jax.training.recorded_views import RecordedViews
@@ -139,6 +141,7 @@ class StageRun:
         resume: Checkpoint | None = None,
         num_restored: int | None = None,
         session: Session | None = None,
+        max_memory: int | None = None,
     ):
         """Args:
         scene: training views and points.
@@ -148,6 +151,7 @@ class StageRun:
         resume: a checkpoint of this stage, or of the end of the stage that it continues (`checkpoint.check_resume`).
         num_restored: which order of the views, from 0; None: the checkpoint's order, or the first.
         session: what trainings of this process share; None: a new one.
+        max_memory: bytes that may be in use; None: what the machine or the GPU has available.
         """
         self.session = session or Session()
         self.mesh = self.session.mesh
@@ -184,6 +188,10 @@ class StageRun:
         self.effects = StageEffects(self.stage, system, len({view.picture.size for view in self.views}))
         self.capacities: dict[Size, int] = {}
         """Capacities of the tile lists that steps are compiled for."""
+        self.memory: float | None = None
+        """Bytes in use while a step runs; None: no step is compiled yet."""
+        self._max_memory = max_memory
+        self._later_bytes = 0.0
         self.started = time.perf_counter()
         self.time_left: datetime.timedelta | None = None
         """Remaining time of the run, about; None at the beginning."""
@@ -228,6 +236,7 @@ class StageRun:
         """Run the stage to its end, then release its photographs. If it is stopped, write a last checkpoint and raise
         `Interrupted`.
         """
+        self._later_bytes = progress.after.model_bytes
         iteration = int(self.state.iteration)
         end = self.stage.iterations
         self.effects.warn_of_never()
@@ -256,7 +265,7 @@ class StageRun:
                 pace.time(iteration, effects.num_compiled, ahead, effects.seconds_a_program)
                 forecast = pace.told(iteration)
                 if forecast is not None:
-                    display.tell(forecast)
+                    display.tell(f"{forecast}; {in_bytes(self.memory or 0)} of memory")
                 self.time_left = pace.left(iteration)
                 # `iteration` is less if a step could not be taken or training is being stopped.
                 if iteration == stop:
@@ -313,6 +322,8 @@ class StageRun:
         info: StepInfo
         with compilations() as programs:
             try:
+                if self.memory is None:
+                    self.memory = self._memory_of(arguments)
                 self.state, info = jitted_step()(*arguments)
             except ValueError as error:  # The step is not compiled for the name of its stage.
                 raise ValueError(f"stage {self.stage.name!r}: {error}") from error
@@ -320,6 +331,15 @@ class StageRun:
         if programs:
             self.session.after_compiling()
         return info
+
+    def _memory_of(self, arguments: tuple[Any, ...]) -> float:
+        """Compile the first step, and return the bytes in use while it runs. Raises ValueError if it cannot fit, or, as
+        far as is known, a later stage of the run."""
+        # The call that follows finds this program, in JAX's cache of this process.
+        step = jitted_step().lower(*arguments).compile()
+        own = sum(leaf.nbytes for leaf in jax.tree.leaves(self.state.model))
+        growth = max(0.0, self._later_bytes - own)
+        return check_step_fits(step, growth, self.system, self.session.devices, self._max_memory)
 
     def arguments(self, iteration: int) -> tuple[Any, ...]:
         """Return the arguments of the step of an iteration."""

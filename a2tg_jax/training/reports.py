@@ -37,6 +37,8 @@ class RestOfRun(NamedTuple):
     """Its time as a number of the stage's iterations, without compilation."""
     programs: int = 0
     """Number of programs to compile."""
+    model_bytes: float = 0.0
+    """Bytes of the largest model."""
 
 
 class Display:
@@ -68,7 +70,7 @@ class Display:
         """
 
     def tell(self, text: str) -> None:
-        """Show a forecast of the remaining time in words, which is made twice in a stage."""
+        """Show a forecast of remaining time and memory in words, which is made twice in a stage."""
 
 
 class Progress(NamedTuple):
@@ -79,7 +81,7 @@ class Progress(NamedTuple):
     title: str | None = None
     """Its title; None: the stage's name."""
     after: RestOfRun = RestOfRun()
-    """Work after the stage, for the remaining time that is shown."""
+    """Work after the stage, for the remaining time that is shown and the memory of later stages."""
 
 
 class Pace:

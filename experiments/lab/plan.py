@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 import a2tg_jax as a2tg
+from a2tg_jax.base.machine import num_threads
 from a2tg_jax.base.text import in_bytes
 from a2tg_jax.data.synthetic import BUILT_IN
 from a2tg_jax.events import HostEvent
-from a2tg_jax.training.cost import forecast_stages
 from lab.grid import Grid, Run
 from lab.jobs import Folders, Job, Record, model_bytes, num_gaussians
 from lab.markdown import table
@@ -20,6 +20,9 @@ GPU_SECONDS, GPU_SECONDS_PER_GAUSSIAN = 0.002, 2.4e-8
 """Time of a plain step: 14 ms for 500,000 Gaussians, from the paper's 7.18 minutes for 30,000 iterations."""
 GPU_TEXTURED = 2.0
 """Ratio of a textured step to a plain one: 19.7 minutes, if they are for both stages, leave 25 ms a step."""
+CPU_SECONDS_PER_GAUSSIAN = 2.4e-6
+"""Seconds for a view on one core (docs/performance.md); all cores share them."""
+CPU_SECONDS_PER_PIXEL = 0.72e-6
 COMPILE_SECONDS, OTHER_SECONDS = 5.0, 4.0
 """Seconds on one core to compile a program of training, and to load, measure and save a stage."""
 MOST_ROWS = 40
@@ -136,14 +139,13 @@ class Forecaster:
     def __init__(self, folders: Folders):
         self._folders = folders
         self._scenes: dict[tuple, a2tg.Scene] = {}
-        self._chains: dict[str, list[float]] = {}
 
     def seconds(self, job: Job) -> float:
         """Return the seconds of a stage's steps."""
-        last = dataclasses.replace(job, stage=len(job.system.stages()) - 1).key
-        if last not in self._chains:
-            self._chains[last] = [stage.seconds for stage in forecast_stages(self._scene(job), job.system)]
-        return self._chains[last][job.stage]
+        views = self._scene(job).train
+        pixels = sum(view.camera.width * view.camera.height for view in views) / len(views)
+        view_seconds = CPU_SECONDS_PER_GAUSSIAN * num_gaussians(job.system) + CPU_SECONDS_PER_PIXEL * pixels
+        return job.iterations * job.system.batch_size * view_seconds / num_threads()
 
     def has_scene(self, job: Job) -> bool:
         """Return whether the scene of a stage is there."""
