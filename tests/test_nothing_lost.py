@@ -563,7 +563,7 @@ def test_a_run_with_a_file_budget_ends_with_its_file(tmp_path, monkeypatch, caps
     """If the program is killed before, the resumed run writes it, once. Without a file the run is finished, too."""
     asked = []
 
-    def compress(path, out, options, *, scene, progress):
+    def compress(path, out, options, *, scene, progress, on_note):
         asked.append((path, options.file_budget, options.tune_iterations, progress))
         if len(asked) == 1:
             raise KeyboardInterrupt

@@ -1,11 +1,12 @@
 """Command-line arguments parsed into a dataclass by tyro, which prints help and errors and ends in SystemExit."""
 
 import dataclasses
+import functools
 import inspect
 import os
 import types
 import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -17,13 +18,26 @@ from tyro.constructors import (
     PrimitiveConstructorSpec,
     PrimitiveTypeInfo,
     StructConstructorSpec,
+    StructFieldSpec,
     StructTypeInfo,
 )
 
 from a2tg_jax.base.regular_files import expanded
-from a2tg_jax.host.command_words import defaulting_to
 
 Parsed = TypeVar("Parsed")
+
+
+FLAGS: dict[type, Mapping[str, tuple[Any, ...]]] = {}
+"""Annotations for tyro of the fields of classes outside the command line; modules of commands add them."""
+
+
+print_now = functools.partial(print, flush=True)
+"""Print a line that is read while the program works."""
+
+
+def defaulting_to(text: str, metavar: str | None = None) -> Any:
+    """Return the annotation of an option whose help describes its default in words, instead of None."""
+    return arg(help_behavior_hint=f"(default: {text})", metavar=metavar)
 
 
 LastModel = Annotated[
@@ -49,17 +63,7 @@ LpipsWeights = Annotated[
 ]
 
 
-Rule = Callable[[StructTypeInfo], StructConstructorSpec | None]
-"""Function that returns how tyro fills a class, or None for other classes."""
-
-
-def parse(
-    kind: type[Parsed],
-    program: str,
-    arguments: Sequence[str],
-    default: Parsed | None = None,
-    rule: Rule | None = None,
-) -> Parsed:
+def parse(kind: type[Parsed], program: str, arguments: Sequence[str], default: Parsed | None = None) -> Parsed:
     """Parse arguments into an instance of a dataclass.
 
     Args:
@@ -67,18 +71,14 @@ def parse(
       program: name of the command in the help.
       arguments: arguments without the command's name.
       default: values of the options that are not given; None: the dataclass's own.
-      rule: rule for a class in it that knows no command line.
 
     Raises:
       SystemExit: after help (code 0) or an error (code 2), which tyro has printed.
       ValueError: if a path is a URL.
     """
-    if {"-h", "--help"} & set(arguments):  # It takes a second.
-        _fill_help(default or kind)
     rules = ConstructorRegistry()
     rules.primitive_rule(_optional_rule)
-    if rule is not None:
-        rules.struct_rule(rule)
+    rules.struct_rule(_dataclass_rule)
     about = inspect.getdoc(kind) or ""
     given: dict[str, Any] = {}
     if default is not None:
@@ -97,22 +97,47 @@ def at_home(word: str) -> str:
     return flag + equals + os.path.expanduser(text)
 
 
-def _fill_help(value: Any) -> None:
-    """Make each option's help one paragraph, in a dataclass and those in its fields; tyro would keep the source's line
-    breaks."""
-    kind = value if isinstance(value, type) else type(value)
-    # Bases first, because texts of subclasses replace theirs; the last one is object.
+@functools.cache
+def _texts_of(kind: type) -> dict[str, str]:
+    """Return the help of each option of a dataclass as one paragraph; tyro would keep the source's line breaks."""
     texts = {}
+    # Bases first, because texts of subclasses replace theirs; the last one is object.
     for base in kind.__mro__[-2::-1]:
         for param in parse_from_object(base).params:
             if param.description:
                 texts[param.arg_name] = " ".join(param.description.split())
+    return texts
+
+
+def _dataclass_rule(info: StructTypeInfo) -> StructConstructorSpec | None:
+    """Return the rule for a dataclass, whose fields are annotated as in `FLAGS`; None for other classes."""
+    kind = info.type
+    if not dataclasses.is_dataclass(kind):
+        return None
+    annotations = FLAGS.get(kind, {})
+    hints = typing.get_type_hints(kind, include_extras=True)
+    fields = []
     for field in dataclasses.fields(kind):
-        if field.name in texts:
-            field.metadata = types.MappingProxyType({**field.metadata, "help": texts[field.name]})
-        inner = getattr(value, field.name, None)
-        if dataclasses.is_dataclass(inner) and not isinstance(inner, type):
-            _fill_help(inner)
+        hint = hints[field.name]
+        for annotation in annotations.get(field.name, ()):
+            hint = Annotated[hint, annotation]
+        # Only a help text needs the docstrings, whose parsing takes a second.
+        help_text = functools.partial(_help_text, kind, field.name)
+        fields.append(StructFieldSpec(field.name, hint, _default_of(field, info.default), help_text))
+    return StructConstructorSpec(kind, tuple(fields))
+
+
+def _help_text(kind: type, name: str) -> str | None:
+    return _texts_of(kind).get(name)
+
+
+def _default_of(field: dataclasses.Field[Any], whole: Any) -> Any:
+    """Return the default of a field, given the default of its dataclass, which may be missing."""
+    if dataclasses.is_dataclass(whole):
+        return getattr(whole, field.name)
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return tyro.MISSING if field.default is dataclasses.MISSING else field.default
 
 
 def _optional_rule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:

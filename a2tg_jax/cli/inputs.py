@@ -1,7 +1,6 @@
 """The commands that make scene folders: `a2tg sfm` finds cameras, `a2tg download` fetches benchmark data sets."""
 
 import dataclasses
-import functools
 import shlex
 from pathlib import Path
 from typing import Annotated
@@ -9,13 +8,13 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from a2tg_jax.base.text import did_you_mean
+from a2tg_jax.cli.arguments import defaulting_to, print_now
 from a2tg_jax.data.download import BENCHMARK_SETS, fetch
 from a2tg_jax.data.load import is_scene
 from a2tg_jax.data.photo_folder import CAMERA_PICTURE, holds_photos
 from a2tg_jax.data.sfm import CameraModel, Matching, run_sfm
 from a2tg_jax.data.staging import Panorama
 from a2tg_jax.data.video import DEFAULT_FRAMES
-from a2tg_jax.host.command_words import defaulting_to
 from a2tg_jax.results.commands import quick_flags
 from a2tg_jax.results.figures import save_camera_picture
 from a2tg_jax.results.output_paths import check_apart, check_output
@@ -75,7 +74,7 @@ class Sfm:
             matching=self.matching,
             frames=self.frames,
             panorama=self.panorama,
-            on_note=functools.partial(print, flush=True),
+            on_note=print_now,
         )
         save_camera_picture(out, out / CAMERA_PICTURE)
         print(

@@ -167,9 +167,9 @@ def parsed(name: str, arguments: Sequence[str]) -> Any:
     words = ["--help" if word == "--help-all" else word for word in arguments]
     if name != "train":
         return parse(kind, program, words)
-    from a2tg_jax.cli.train import scene_rule, train_defaults
+    from a2tg_jax.cli.train import train_defaults
 
-    return parse(kind, program, words, train_defaults(arguments), scene_rule)
+    return parse(kind, program, words, train_defaults(arguments))
 
 
 def _fail(message: str) -> int:

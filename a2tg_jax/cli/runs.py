@@ -9,12 +9,20 @@ from tyro.conf import Positional, arg
 
 from a2tg_jax.base.regular_files import is_regular
 from a2tg_jax.base.text import counted
-from a2tg_jax.cli.arguments import EditFile, LastModel, LpipsWeights, RunFolderPath, RunOrFile
+from a2tg_jax.cli.arguments import (
+    FLAGS,
+    EditFile,
+    LastModel,
+    LpipsWeights,
+    RunFolderPath,
+    RunOrFile,
+    defaulting_to,
+    print_now,
+)
 from a2tg_jax.cli.train import open_browser, print_result
-from a2tg_jax.host.command_words import defaulting_to
 from a2tg_jax.io.formats import splats_at
 from a2tg_jax.mesh.files import mesh_files
-from a2tg_jax.results.compression import CompressOptions, compress
+from a2tg_jax.results.compression import MAX_LOSS, CompressOptions, compress
 from a2tg_jax.results.conversion import BakeOptions, PlacementOptions, convert
 from a2tg_jax.results.editing import EditOptions, write_edit
 from a2tg_jax.results.finish_record import FinishOptions
@@ -31,13 +39,30 @@ from a2tg_jax.results.frames import (
     write_video,
 )
 from a2tg_jax.results.info import describe_file, describe_run, describe_runs, facts_or_damage, file_facts, run_facts
-from a2tg_jax.results.meshing import MeshOptions, write_mesh
+from a2tg_jax.results.meshing import TEXTURED_FACES, MeshOptions, write_mesh
 from a2tg_jax.results.model_source import open_source
 from a2tg_jax.results.output_paths import check_apart, check_export, check_not_source, check_output
 from a2tg_jax.results.report import metrics_json
 from a2tg_jax.results.run_evaluation import check_weights, evaluate_run
 from a2tg_jax.results.viewing import check_page, export_comparison, export_web, routes_of
 from a2tg_jax.web.server import LOOPBACK, serve
+
+FLAGS[CompressOptions] = {
+    "max_loss": (defaulting_to(f"{MAX_LOSS:g}", "DB"),),
+    "file_budget": (defaulting_to("--max-loss decides", "SIZE"),),
+}
+FLAGS[EditOptions] = {
+    "crop": (arg(metavar="LOW:HIGH"),),
+    "upright": (arg(metavar="PHOTOGRAPH"),),
+    "background": (arg(metavar="COLOR"),),
+}
+FLAGS[MeshOptions] = {
+    "resolution": (defaulting_to("512, unless --voxel is given", "N"),),
+    "voxel": (defaulting_to("radius / resolution", "LENGTH"),),
+    "radius": (defaulting_to("twice the cameras' median distance from it", "LENGTH"),),
+    "faces": (defaulting_to(f"all, or {TEXTURED_FACES:,} with a texture", "N"),),
+    "max_memory": (defaulting_to("half of the free memory", "SIZE"),),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -203,7 +228,7 @@ class MeshCommand:
         if is_run and out.resolve() == default.resolve():
             # Listed, so that the next a2tg mesh may replace it (check_export).
             RunFolder(self.source).own(default)
-        print(write_mesh(source, out, self.options))
+        print(write_mesh(source, out, self.options, print_now))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -388,7 +413,11 @@ class Compress:
     """Print a table of the loss and the bytes of each choice of bits."""
 
     def run(self) -> None:
-        print(compress(self.source, self.out, self.options, overwrite=self.overwrite, verbose=self.verbose))
+        print(
+            compress(
+                self.source, self.out, self.options, overwrite=self.overwrite, verbose=self.verbose, on_note=print_now
+            )
+        )
 
 
 @dataclasses.dataclass(frozen=True)

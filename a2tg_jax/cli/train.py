@@ -9,24 +9,22 @@ import webbrowser
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Annotated, get_type_hints
+from typing import Annotated
 
 import jax
 import tyro
-from tyro.conf import Positional, arg
-from tyro.constructors import StructConstructorSpec, StructFieldSpec, StructTypeInfo
+from tyro.conf import Fixed, Positional, Suppress, UseAppendAction, arg
 
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.base.machine import tidy_memory
 from a2tg_jax.base.operating_system import has_display
 from a2tg_jax.base.regular_files import expanded
 from a2tg_jax.base.text import counted
-from a2tg_jax.cli.arguments import LpipsWeights
+from a2tg_jax.cli.arguments import FLAGS, LpipsWeights, defaulting_to, print_now
 from a2tg_jax.cli.processes import AUTO, ProcessPlace, joined
 from a2tg_jax.core.budget import budget_in_bytes
 from a2tg_jax.core.config_json import flatten_config
 from a2tg_jax.data.load import SceneSource
-from a2tg_jax.host.command_words import defaulting_to
 from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.results.commands import file_command, resuming_command
 from a2tg_jax.results.folder import RunFolder, open_run, opened
@@ -49,6 +47,17 @@ from a2tg_jax.systems.a2tg import A2tg
 from a2tg_jax.training import Session
 from a2tg_jax.training.loop import Watch
 
+FLAGS[SceneSource] = {"path": (Positional, arg(metavar="SCENE"))}
+FLAGS[RunRecord] = {
+    "scene": (arg(name=""),),
+    "system": (arg(metavar="NAME"),),
+    "options": (arg(name=""),),
+    "compare": (UseAppendAction, arg(metavar="NAME")),
+    "preset": (arg(metavar="NAME", help_behavior_hint="(default: paper)"),),
+    "init": (arg(metavar="FILE"),),
+    "file_budget": (arg(metavar="SIZE"),),
+    "compare_options": (Fixed, Suppress),
+}
 BASELINE = "gaussians-2d-mcmc"
 HEARTBEAT_TIMEOUT = 60.0
 """Default of --heartbeat-timeout-seconds."""
@@ -84,7 +93,10 @@ class Demo:
 
     def run(self) -> None:
         options = RunOptions(
-            overwrite=self.overwrite, session=Session(after_compiling=tidy_memory), progress=not self.quiet
+            overwrite=self.overwrite,
+            session=Session(after_compiling=tidy_memory),
+            progress=not self.quiet,
+            on_note=print_now,
         )
         if self.resume:
             resume(self.out, options)
@@ -188,6 +200,7 @@ class Train:
                 tensorboard=self.tensorboard,
                 progress=not self.quiet,
                 watched=in_browser if self.view else unseen,
+                on_note=print_now,
                 confirm=warn if self.yes else ask,
                 session=session,
             )
@@ -312,19 +325,6 @@ def train_defaults(arguments: Sequence[str]) -> Train:
     if not given.resume and (given.preset or given.system not in ("", record.system)):
         record = record.with_system(given.system or record.system, given.preset or None)
     return Train(record, tyro.MISSING)  # tyro requires what is MISSING.
-
-
-def scene_rule(info: StructTypeInfo) -> StructConstructorSpec | None:
-    """Return the options of a scene's source, with its path as the argument SCENE; None for other classes."""
-    if info.type is not SceneSource:
-        return None
-    kinds = get_type_hints(SceneSource)
-    kinds["path"] = Annotated[Positional[str], arg(metavar="SCENE")]
-    fields = []
-    for field in dataclasses.fields(SceneSource):
-        default = getattr(info.default, field.name, field.default)
-        fields.append(StructFieldSpec(field.name, kinds[field.name], default, field.metadata.get("help")))
-    return StructConstructorSpec(SceneSource, tuple(fields))
 
 
 def defaults_line(arguments: Sequence[str]) -> str:

@@ -4,9 +4,8 @@ the choices tried."""
 import dataclasses
 import functools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Annotated
 
 from a2tg_jax.base.atomic import write_whole
 from a2tg_jax.base.text import in_bytes, shortened
@@ -36,7 +35,6 @@ from a2tg_jax.finish.tuning import (
     smallest_tuned,
     tune_compact,
 )
-from a2tg_jax.host.command_words import defaulting_to
 from a2tg_jax.io.compact import GROUPS, CompactChoices, encode_model
 from a2tg_jax.io.formats import FORMATS
 from a2tg_jax.io.model_rows import check_encodable
@@ -61,9 +59,9 @@ MOST_VIEWS = 16
 class CompressOptions:
     """Aim of a compression: a loss, or bytes."""
 
-    max_loss: Annotated[float | None, defaulting_to(f"{MAX_LOSS:g}", "DB")] = None
+    max_loss: float | None = None
     """Largest loss of PSNR in dB."""
-    file_budget: Annotated[float | str | None, defaulting_to("--max-loss decides", "SIZE")] = None
+    file_budget: float | str | None = None
     """Largest size of the file, such as 60kB, instead of --max-loss."""
     tune_iterations: int = 0
     """Iterations of training with rounding, which makes up for fewer bits; 1000 is a good number. The model is
@@ -99,6 +97,7 @@ def compress(
     verbose: bool = False,
     scene: Scene | None = None,
     progress: bool = True,
+    on_note: Callable[[str], object] = lambda line: None,
 ) -> str:
     """Write the smallest compact file of a model within a given loss, or the best one within given bytes, and return a
     line about it.
@@ -114,6 +113,7 @@ def compress(
       verbose: return a table of the choices tried before that line.
       scene: the run's photographs, if they are loaded already.
       progress: show progress bars.
+      on_note: function that receives a line before the minutes of trials.
 
     Raises:
       ValueError, OSError: if the model or the photographs for tuning are missing, the file exists, a compact file
@@ -155,9 +155,7 @@ def compress(
     measures = list(losses.values())
     num_ways = sum(map(len, ladder.values()))
     tunings = f", then training up to {MOST_TUNINGS} times" if tune else ""
-    print(
-        f"trying up to {num_ways} ways to round the model's numbers{tunings}; on a CPU this takes minutes", flush=True
-    )
+    on_note(f"trying up to {num_ways} ways to round the model's numbers{tunings}; on a CPU this takes minutes")
     trials = measure_choices(model, measures, ladder, progress=progress)
     untuned, tuned = _search(model, measures, options.most_loss, max_bytes, trials, tune)
     chosen, data = _better(model, untuned, tuned, options.most_loss, max_bytes)

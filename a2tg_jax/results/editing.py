@@ -4,11 +4,9 @@ import dataclasses
 import re
 import time
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 from PIL import ImageColor
-from tyro.conf import arg
 
 from a2tg_jax.base.text import did_you_mean
 from a2tg_jax.core.camera_paths import vertical_in
@@ -28,15 +26,15 @@ AXES |= {f"-{name}": -axis for name, axis in AXES.items()}
 class EditOptions:
     """Changes to a model, with the percentages of the viewer's sliders."""
 
-    crop: Annotated[tuple[str, str, str] | None, arg(metavar="LOW:HIGH")] = None
+    crop: tuple[str, str, str] | None = None
     """Upright box to keep: from and to along width, depth and height, in percent of the largest box; 50 is the middle
     of the scene, and 0 and 100 cut nothing. Such as 35:65 35:65 0:100."""
     floaters: float = 0.0
     """Strictness in percent with which floaters are removed; 0 removes none."""
-    upright: Annotated[str | None, arg(metavar="PHOTOGRAPH")] = None
+    upright: str | None = None
     """The vertical: the name of a photograph that was held level, or an axis of the original world that is up, such as
     y; write --upright=-y for one with a minus."""
-    background: Annotated[str | None, arg(metavar="COLOR")] = None
+    background: str | None = None
     """Colour behind the scene, such as white or #ff8000."""
 
     def edit_of(self, model: Model) -> Edit:

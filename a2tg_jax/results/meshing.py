@@ -2,9 +2,9 @@
 
 import dataclasses
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -12,7 +12,6 @@ from a2tg_jax.base.machine import memory_limit
 from a2tg_jax.base.text import counted, in_bytes
 from a2tg_jax.core.budget import budget_in_bytes
 from a2tg_jax.core.origin import Origin
-from a2tg_jax.host.command_words import defaulting_to
 from a2tg_jax.host.progress_bars import progress_over
 from a2tg_jax.mesh.extract import MOST_CLUSTERS, check_lengths, extract_mesh
 from a2tg_jax.mesh.files import check_mesh_suffix, save_mesh
@@ -33,24 +32,24 @@ TextureSource = Literal["none", "renders", "photographs"]
 class MeshOptions:
     """Options of a mesh; lengths are in units of the original world."""
 
-    resolution: Annotated[int | None, defaulting_to("512, unless --voxel is given", "N")] = None
+    resolution: int | None = None
     """Voxels along the radius."""
-    voxel: Annotated[float | None, defaulting_to("radius / resolution", "LENGTH")] = None
+    voxel: float | None = None
     """Side of a voxel in units of the original world."""
-    radius: Annotated[float | None, defaulting_to("twice the cameras' median distance from it", "LENGTH")] = None
+    radius: float | None = None
     """Radius around the point that the cameras look at, in units of the original world."""
     unbounded: bool = False
     """Continue beyond the radius, with voxels that grow with the distance."""
     clusters: int = MOST_CLUSTERS
     """Largest number of connected parts to keep; smaller ones are floaters."""
-    faces: Annotated[int | None, defaulting_to(f"all, or {TEXTURED_FACES:,} with a texture", "N")] = None
+    faces: int | None = None
     """Largest number of faces. Needs pip install 'a2tg-jax[mesh]'."""
     texture: TextureSource = "none"
     """Fill a texture atlas from renders or photographs of the training views (GLB and OBJ). Needs xatlas (pip install
     'a2tg-jax[mesh]')."""
     texture_size: int = 2048
     """Side of the atlas in texels."""
-    max_memory: Annotated[str | None, defaulting_to("half of the free memory", "SIZE")] = None
+    max_memory: str | None = None
     """Memory budget of the voxels, such as 4GB."""
 
     @property
@@ -78,8 +77,11 @@ class MeshOptions:
             check_simplifying(self.most_faces)
 
 
-def write_mesh(source: Source, out: Path, options: MeshOptions) -> str:
-    """Extract the mesh of a model, write it as `save_mesh` does, and return a summary.
+def write_mesh(
+    source: Source, out: Path, options: MeshOptions, on_note: Callable[[str], object] = lambda line: None
+) -> str:
+    """Extract the mesh of a model, write it as `save_mesh` does, and return a summary. `on_note` receives a line before
+    a texture is made.
 
     Raises:
       ValueError: if the model has no cameras or no surface, the photographs are missing, or the voxels need too much
@@ -107,7 +109,7 @@ def write_mesh(source: Source, out: Path, options: MeshOptions) -> str:
     )
     mesh = result.mesh if options.most_faces is None else simplify_mesh(result.mesh, options.most_faces)
     if options.texture != "none":
-        print(f"unwrapping {counted(mesh.num_faces, 'face')}", flush=True)
+        on_note(f"unwrapping {counted(mesh.num_faces, 'face')}")
         mesh = texture_mesh(mesh, pictures, size=options.texture_size)
     files = save_mesh(out, mesh, origin)
     size = in_bytes(sum(file.stat().st_size for file in files))

@@ -1,8 +1,8 @@
 """Checks of paths to write, before any work: whether a file can be made there, and whether it may replace another."""
 
 import os
-import sys
 import tempfile
+import warnings
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -16,7 +16,7 @@ EXPORTS = (".a2tgz", ".glb")
 def check_output(path: Path) -> None:
     """Raise ValueError, or OSError of a link, if a file or folder cannot be made, naming the obstacle.
 
-    Several levels of new folders outside the current one, such as on a misspelt drive, are reported on stderr.
+    Warns of several levels of new folders outside the current one, such as on a misspelt drive.
     """
     place = Path(os.path.abspath(file_to_write(path)))
     missing = [folder for folder in (place, *place.parents) if not folder.exists()]
@@ -33,7 +33,7 @@ def check_output(path: Path) -> None:
     except OSError as error:
         raise ValueError(f"{path} cannot be made, because {existing} is not writable: {error.strerror}") from None
     if len(missing) > 1 and not existing.is_relative_to(os.getcwd()):
-        print(f"a2tg: {missing[-1]} does not exist and will be made", file=sys.stderr)
+        warnings.warn(f"{missing[-1]} does not exist and will be made", stacklevel=2)
 
 
 def check_apart(out: Path, other: Path) -> None:

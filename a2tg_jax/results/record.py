@@ -23,10 +23,9 @@ import warnings
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import tomli_w
-from tyro.conf import Fixed, Suppress, UseAppendAction, arg
 
 from a2tg_jax.base.atomic import write_whole
 from a2tg_jax.base.json_text import MOST_TOML_BYTES, parse_toml
@@ -57,27 +56,25 @@ PLAIN = ("gaussians-2d", "gaussians-2d-mcmc")
 class RunRecord:
     """Scene, system and options of a run: what `a2tg train` parses, and what run.toml keeps."""
 
-    scene: Annotated[SceneSource, arg(name="")]
-    system: Annotated[str, arg(metavar="NAME")] = DEFAULT_SYSTEM
+    scene: SceneSource
+    system: str = DEFAULT_SYSTEM
     """System to train: a name listed by a2tg --help, or your own as package.module:NAME. Its options follow below."""
-    options: Annotated[System, arg(name="")] = dataclasses.field(default_factory=Bytewise)
-    compare: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME")] = ()
+    options: System = dataclasses.field(default_factory=Bytewise)
+    compare: tuple[str, ...] = ()
     """System to train for comparison; may be repeated. It takes every option above and below that it has."""
-    preset: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: paper)")] = None
+    preset: str | None = None
     """Preset of the options below: paper, quick (minutes on two cores) or smoke (half a minute); a2tg also has official
     (the conventions of the authors' program), gaussians-2d also has surfaces (for a2tg mesh)."""
     on_nan: OnNan = "stop"
     """Action if training diverges (a loss or gradient is not finite, or the loss explodes): stop, or restore the newest
     checkpoint and continue with the views in another order."""
-    init: Annotated[str | None, arg(metavar="FILE")] = None
+    init: str | None = None
     """File of splats (PLY, SPZ, SOG, a checkpoint of gsplat, ...) instead of the first stage, in the world of the
     scene folder."""
-    file_budget: Annotated[float | str | None, arg(metavar="SIZE")] = None
+    file_budget: float | str | None = None
     """Largest size of a compact file (*.a2tgz), such as 60kB. It is written when training is over, as by a2tg compress
     --tune-iterations 1000. Without a memory_budget the model gets 7 times as many bytes in memory."""
-    compare_options: Annotated[Mapping[str, Mapping[str, Any]], Fixed, Suppress] = dataclasses.field(
-        default_factory=dict, compare=False
-    )
+    compare_options: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict, compare=False)
     """Options of the compared systems, nested, by name. Missing ones take the main system's values, or the preset's if
     it lacks them. run.toml keeps all those that the main system lacks."""
 

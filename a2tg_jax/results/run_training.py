@@ -71,6 +71,8 @@ class RunOptions:
     progress: bool = True
     """Show progress bars."""
     watched: Watched = unseen
+    on_note: Callable[[str], object] = lambda line: None
+    """Function that receives lines about the run."""
     confirm: Callable[[Sequence[str]], None] = warn
     """Function called with the doubts about a new run (`doubts_about`), if there are any; it may raise ValueError."""
     session: Session = dataclasses.field(default_factory=Session)
@@ -120,7 +122,7 @@ def resume_run(run: RunFolder, options: RunOptions) -> RunResult:
     check_weights(options.lpips_weights)
     record = read_record(run)
     if is_finished(run, record):
-        print(f"{run.path} is finished; to train it on: {resuming_command(run)} --more 2000", flush=True)
+        options.on_note(f"{run.path} is finished; to train it on: {resuming_command(run)} --more 2000")
     scene = record.scene.load(room_for_photographs(options.max_memory))
     if record.init is not None and not run.model(record.plan.main[0]).is_file():
         write_first_stage(run, record, load_splats(Path(record.init)), scene)
@@ -144,7 +146,7 @@ def _train_and_measure(run: RunFolder, record: RunRecord, scene: Scene, options:
         leave_others()
         result = evaluate_run(run, scene, lpips_weights=options.lpips_weights)
         if record.file_bytes is not None:
-            _write_file(run, record, record.file_bytes, scene, progress=options.progress)
+            _write_file(run, record, record.file_bytes, scene, options)
         return result
     except KeyboardInterrupt as interrupt:
         number = getattr(interrupt, "number", signals.CTRL_C)
@@ -175,15 +177,16 @@ def how_to_go_on(run: RunFolder, devices: Devices | None = None) -> str:
     return f"{kept}; continue with: {resuming_command(run, devices)}"
 
 
-def _write_file(run: RunFolder, record: RunRecord, max_bytes: int, scene: Scene, *, progress: bool) -> None:
-    """Write the file of a file budget, unless it is there, and print a line about it; warn if none is small enough."""
+def _write_file(run: RunFolder, record: RunRecord, max_bytes: int, scene: Scene, options: RunOptions) -> None:
+    """Write the file of a file budget, unless it is there; warn if none is small enough."""
     model = run.model(record.plan.main[-1])
     path = model.with_suffix(SUFFIX)
     if path.is_file() and path.stat().st_size <= max_bytes and path.stat().st_mtime >= model.stat().st_mtime:
         return
-    options = CompressOptions(file_budget=record.file_budget, tune_iterations=ITERATIONS)
+    aim = CompressOptions(file_budget=record.file_budget, tune_iterations=ITERATIONS)
     try:
-        print(compress(run.path, None, options, scene=scene, progress=progress), flush=True)
+        line = compress(run.path, None, aim, scene=scene, progress=options.progress, on_note=options.on_note)
+        options.on_note(line)
     except ValueError as error:
         another = file_command(run, "SIZE")
         warnings.warn(f"no file was written: {error}; to try another size: {another}", stacklevel=2)
