@@ -27,7 +27,7 @@ from a2tg_jax.cli import doctor, main as cli
 from a2tg_jax.cli.train import Train, train_defaults
 from a2tg_jax.data.load import SceneSource
 from a2tg_jax.host import startup
-from a2tg_jax.results import finishing, run_training, stage_training, viewing
+from a2tg_jax.results import finishing, page_export, run_training, stage_training
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.frames import LIST
 from a2tg_jax.results.history import read_history
@@ -446,7 +446,7 @@ def test_export_and_what_view_would_serve(run, tmp_path, monkeypatch, capsys):
     listed = json.loads((tmp_path / "site" / "photographs.json").read_text())
     assert listed and len(list((tmp_path / "site" / "photographs").glob("*.jpg"))) == len(listed)
     (tmp_path / "site" / "photographs" / "mine.jpg").touch()
-    monkeypatch.setattr(viewing, "loss_measures", lambda *a: {})
+    monkeypatch.setattr(page_export, "loss_measures", lambda *a: {})
     assert cli.main(["export", str(run.path), "--web", str(tmp_path / "site"), "--overwrite"]) == 0
     assert [path.name for path in (tmp_path / "site" / "photographs").iterdir()] == ["mine.jpg"]
     routes = routes_of(open_source(run.path, "a2tg-gaussians"))

@@ -31,12 +31,13 @@ from a2tg_jax import A2tg, Origin, Similarity, save_compact, save_model, save_pl
 from a2tg_jax.appearance import parts
 from a2tg_jax.base.text import in_bytes
 from a2tg_jax.cli.main import main
-from a2tg_jax.results import viewing
+from a2tg_jax.results import page_export
 from a2tg_jax.results.compression import loss_measures
 from a2tg_jax.results.meshing import MeshOptions, write_mesh
 from a2tg_jax.results.model_source import Source, open_source
+from a2tg_jax.results.page_export import export_comparison, export_web
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record
-from a2tg_jax.results.viewing import ServedPhotographs, export_comparison, export_web, routes_of
+from a2tg_jax.results.viewing import CameraPhotographs, routes_of
 from a2tg_jax.web import server
 from a2tg_jax.web.page import viewer_html, viewer_html_with
 from a2tg_jax.web.server import ANY, Door, Route, application, lan_address, serve, served
@@ -442,7 +443,7 @@ def test_a_failed_export_leaves_the_photographs_of_the_old_page(tmp_path, monkey
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch, pytest.raises(OSError, match="No space"):
-        patch.setattr(viewing, "write_whole", full)
+        patch.setattr(page_export, "write_whole", full)
         export_web(source, tmp_path, overwrite=True)
     assert old.is_file()
     export_web(source, tmp_path, overwrite=True)
@@ -459,7 +460,7 @@ def test_a_page_of_someone_else_is_not_replaced(tmp_path):
 def test_photographs_are_those_of_the_cameras():
     scene = synthetic_scene(num_views=4, width=24, height=16, num_points=20)
     origin = origin_of(scene)
-    photographs = ServedPhotographs(origin, lambda: scene)
+    photographs = CameraPhotographs(origin, lambda: scene)
     assert sorted(photographs.views) == [0, 1, 2, 3] and photographs.jpeg(9) is None
     found = np.asarray(Image.open(io.BytesIO(photographs.jpeg(0))), np.float32)
     by_name = {view.name: view for view in (*scene.train, *scene.test)}

@@ -42,9 +42,10 @@ from a2tg_jax.results.info import describe_file, describe_run, describe_runs, fa
 from a2tg_jax.results.meshing import TEXTURED_FACES, MeshOptions, write_mesh
 from a2tg_jax.results.model_source import open_source
 from a2tg_jax.results.output_paths import check_apart, check_export, check_not_source, check_output
+from a2tg_jax.results.page_export import check_page, export_comparison, export_web
 from a2tg_jax.results.report import metrics_json
 from a2tg_jax.results.run_evaluation import check_weights, evaluate_run
-from a2tg_jax.results.viewing import check_page, export_comparison, export_web, routes_of
+from a2tg_jax.results.viewing import routes_of
 from a2tg_jax.web.server import LOOPBACK, serve
 
 FLAGS[CompressOptions] = {
