@@ -325,7 +325,7 @@ def test_the_mesh_of_a_run_is_replaced_by_default_once_the_command_has_written_i
     with_record(tmp_path, RunRecord(SceneSource("synthetic")))
     out = tmp_path / "mesh.glb"
     monkeypatch.setattr(runs, "open_source", lambda *_: None)
-    monkeypatch.setattr(runs, "write_mesh", lambda source, out, options: out.write_text("mesh"))
+    monkeypatch.setattr(runs, "write_mesh", lambda source, out, *_: out.write_text("mesh"))
     out.write_text("mine")
     for words in (["--overwrite"], [], ["--out", str(out)]):
         assert cli.main(["mesh", str(tmp_path), *words]) == 0 and out.read_text() == "mesh"
