@@ -32,7 +32,8 @@ class Worker:
     """The process that reads, started where it is needed."""
 
     def __init__(self, work: Path, seconds: float = SECONDS_A_CASE):
-        self.work, self.seconds = work, seconds
+        self.work = work
+        self.seconds = seconds
         self._process: subprocess.Popen | None = None
 
     def ask(self, number: int, name: str) -> dict:
@@ -88,7 +89,8 @@ def run(worker: Worker, cases: range, keep: Path | None = None, seed: int = SEED
     """
     for index in cases:
         worker.start()  # It reads the sound files first.
-        number, rng = index % len(READERS), np.random.default_rng([seed, index])
+        number = index % len(READERS)
+        rng = np.random.default_rng([seed, index])
         reader = READERS[number]
         name = reader.files[int(rng.integers(len(reader.files)))]
         change = reader.changes[int(rng.integers(len(reader.changes)))]

@@ -29,7 +29,8 @@ def write_runs(folder: Path) -> None:
     for iteration in range(1, 6):
         history = with_row(history, 1, iteration, 0.5 / iteration, 20.0, 12, 0.1, float(iteration))
     for name in SYSTEMS:
-        run, system = create_run(folder / name), chosen_system(name, "smoke")
+        run = create_run(folder / name)
+        system = chosen_system(name, "smoke")
         record = RunRecord(SceneSource("synthetic"), name, system, ("gaussians-2d-mcmc",), "smoke")
         write_record(run, record)
         for planned in record.plan.stages:
@@ -63,7 +64,8 @@ def _command(arguments: list[str]) -> str:
     """The error that a command ends with; empty where it reads all."""
     from a2tg_jax.cli import main as cli
 
-    out, err = io.StringIO(), io.StringIO()
+    out = io.StringIO()
+    err = io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), warnings.catch_warnings():
         code = cli.main(arguments)
     lines = [line for line in err.getvalue().splitlines() if not line.startswith("a2tg: warning: ")]

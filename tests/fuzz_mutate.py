@@ -141,7 +141,8 @@ def of_compact(data, rng):
     head = struct.Struct("<8sHIII")
     magic, version, num_coded, _, _ = head.unpack_from(data)
     rest = data[head.size :]
-    text, body = zlib.decompress(rest[:num_coded]), rest[num_coded:]
+    text = zlib.decompress(rest[:num_coded])
+    body = rest[num_coded:]
     if rng.random() < 0.6:
         text = of_json(text, rng)
     else:
@@ -153,11 +154,13 @@ def of_compact(data, rng):
 
 def of_glb(data, rng):
     """A change of the JSON of a *.glb, or of its binary chunk, under right lengths."""
-    head, chunk = struct.Struct("<4sII"), struct.Struct("<II")
+    head = struct.Struct("<4sII")
+    chunk = struct.Struct("<II")
     magic, version, _ = head.unpack_from(data)
     length, kind = chunk.unpack_from(data, head.size)
     start = head.size + chunk.size
-    text, binary = data[start : start + length], data[start + length + chunk.size :]
+    text = data[start : start + length]
+    binary = data[start + length + chunk.size :]
     if rng.random() < 0.8:
         text = of_json(text, rng)
     else:
@@ -168,7 +171,8 @@ def of_glb(data, rng):
 
 def of_png(data, rng):
     """A change of a chunk of a PNG, under a right checksum."""
-    chunks, at = [], 8
+    chunks = []
+    at = 8
     while at < len(data):
         (length,) = struct.unpack_from(">I", data, at)
         chunks.append((data[at + 4 : at + 8], data[at + 8 : at + 8 + length]))
@@ -199,7 +203,8 @@ def _changed_bytes(data, rng):
         return data[: _place(data, rng) if rng.random() < 0.5 else int(rng.integers(len(data) + 1))]
     if kind in (2, 3):
         if kind == 2:
-            width, order = int(rng.choice([1, 2, 4, 8])), ("little", "big")[rng.integers(2)]
+            width = int(rng.choice([1, 2, 4, 8]))
+            order = ("little", "big")[rng.integers(2)]
             value = int(INTEGERS[rng.integers(len(INTEGERS))]) & (2 ** (8 * width) - 1)
             number = value.to_bytes(width, order)
         else:

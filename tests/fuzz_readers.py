@@ -6,7 +6,8 @@ from collections.abc import Callable
 import fuzz_mutate as mutate
 from fuzz_commands import SYSTEMS
 
-BINARY, TEXT = (mutate.of_bytes,), (mutate.of_text, mutate.of_text, mutate.of_bytes)
+BINARY = (mutate.of_bytes,)
+TEXT = (mutate.of_text, mutate.of_text, mutate.of_bytes)
 JSON = (mutate.of_json, mutate.of_json, mutate.of_json, mutate.of_text, mutate.of_bytes)
 ARCHIVE = (mutate.of_npz, mutate.of_npz, mutate.of_npz, mutate.of_bytes)
 COLMAP = ("cameras", "images", "points3D", "rigs", "frames")

@@ -25,7 +25,8 @@ def _scene(folder: Path, file: Path) -> None:
     assert len(views) >= 2 and np.isfinite(scene.scale) and scene.scale > 0
     assert np.isfinite(scene.points).all() and np.isfinite(scene.colors).all() and len(scene.points) >= 2
     for view in views:
-        viewmat, K = np.asarray(view.camera.viewmat, np.float64), np.asarray(view.camera.K, np.float64)
+        viewmat = np.asarray(view.camera.viewmat, np.float64)
+        K = np.asarray(view.camera.K, np.float64)
         assert np.isfinite(viewmat).all() and np.isfinite(K).all()
         assert np.abs(viewmat[:3, :3] @ viewmat[:3, :3].T - np.eye(3)).max() < 1e-2
         assert 1e-4 < K[0, 0] / view.camera.width < 1e6 and 1e-4 < K[1, 1] / view.camera.height < 1e6
@@ -51,7 +52,8 @@ def _check_model(model):
     assert all(leaf.shape[0] == num for leaf in jax.tree.leaves(model.gaussians))
     if model.textures is not None:
         textures = model.textures
-        bucket, row = np.asarray(textures.bucket), np.asarray(textures.row)
+        bucket = np.asarray(textures.bucket)
+        row = np.asarray(textures.row)
         sizes = np.asarray([len(texels) for texels in textures.buckets])
         assert bucket.shape == row.shape == (num,) and (num == 0 or (row < sizes[bucket]).all())
     if model.origin is not None:
@@ -64,7 +66,8 @@ def _check_model(model):
 
 def _checkpoint(folder: Path, file: Path):
     found = load_checkpoint(file)
-    state, stage = found.state, found.system.stages()[found.stage]
+    state = found.state
+    stage = found.system.stages()[found.stage]
     _check_model(state.model)
     assert found.stage >= 0 and 0 <= int(state.model.num_live) <= state.model.gaussians.means.shape[0]
     assert 0 <= found.iteration <= stage.iterations

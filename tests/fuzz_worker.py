@@ -30,7 +30,8 @@ class Watch:
     """What was written outside of a folder, or run, since it was last asked."""
 
     def __init__(self, folder: Path):
-        self.folder, self.found = str(folder.resolve()), []
+        self.folder = str(folder.resolve())
+        self.found = []
         self.is_on = False
         sys.addaudithook(self._hook)
 
@@ -55,7 +56,8 @@ class Watch:
             self.found.append(f"wrote {event} {place}")
 
     def taken(self) -> list[str]:
-        found, self.found = self.found, []
+        found = self.found
+        self.found = []
         return found
 
 
@@ -88,7 +90,8 @@ def main() -> None:
     work = Path(sys.argv[1]).resolve()
     sys.path.insert(0, str(Path(__file__).parent))
     warnings.simplefilter("ignore")
-    answers, sys.stdout = sys.stdout, sys.stderr
+    answers = sys.stdout
+    sys.stdout = sys.stderr
     import fuzz_seeds
     from fuzz_readers import READERS
     from fuzz_targets import TARGETS
@@ -108,13 +111,15 @@ def main() -> None:
         number, name = json.loads(line)
         reader = READERS[number]
         folder = seeds / reader.folder
-        before, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.perf_counter()
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        start = time.perf_counter()
         watch.is_on = True
         kind, where = outcome(TARGETS[reader.target], folder, folder / name)
         watch.is_on = False
         strayed = watch.taken()
         if strayed:
-            kind, where = ("code run" if strayed[0].startswith("ran") else "written elsewhere"), "; ".join(strayed)
+            kind = "code run" if strayed[0].startswith("ran") else "written elsewhere"
+            where = "; ".join(strayed)
         grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
         answer = {"kind": kind, "where": where, "seconds": time.perf_counter() - start, "megabytes": grown}
         print(json.dumps(answer), file=answers, flush=True)

@@ -15,7 +15,8 @@ class _Loop(Writer):
         dtypes = [aval.dtype for aval in (*closed.in_avals, *closed.out_avals)]
         names = [f"array{k}" for k in range(len(dtypes))]
         super().__init__(module, name, names, ("num",), "float32")
-        num_in, b = len(closed.in_avals), self.b
+        num_in = len(closed.in_avals)
+        b = self.b
         at = Lanes(b, width)
         with self.loop(LONG(0), self.long(self.arguments["num"])) as (k, _):
             places = [self.at(self.arguments[one], k, at.vector(_stored(of))) for one, of in zip(names, dtypes)]  # noqa: B905
@@ -37,7 +38,8 @@ def _stored(dtype) -> ir.Type:
 def run_native(function, arrays, width: int) -> list[np.ndarray]:
     """The flat results of a function of scalars for every entry of arrays, whose length `width` divides."""
     closed, _ = trace(function, *(jax.ShapeDtypeStruct((), array.dtype) for array in arrays))
-    name, module = llvm_code.unique("looped"), ir.Module("test")
+    name = llvm_code.unique("looped")
+    module = ir.Module("test")
     _Loop(module, name, closed, width)
     (run,) = llvm_code.compiled(module, {name: (len(closed.in_avals) + len(closed.out_avals), 1)})
     results = [np.empty(len(arrays[0]), aval.dtype) for aval in closed.out_avals]

@@ -93,7 +93,8 @@ def attempted(found, own, index, start, count, is_streamed=False):
 def close(expected, found, tolerance):
     """Floats agree, relative to the largest of their array; all else is equal."""
     for a, b in zip(jax.tree.leaves(expected), jax.tree.leaves(found), strict=True):
-        a, b = np.asarray(a), np.asarray(b)
+        a = np.asarray(a)
+        b = np.asarray(b)
         if a.dtype.kind == "f":
             np.testing.assert_allclose(b, a, rtol=0, atol=tolerance * max(np.abs(a).max(), 1e-9))
         else:
@@ -232,7 +233,8 @@ def details(folder):
 
 def shared(folder):
     """What Gaussians share learns as on one device."""
-    own, networks = dataclasses.replace(Own(events="splitting", sh_degree=0, stage1_iterations=12), batch_size=4), []
+    own = dataclasses.replace(Own(events="splitting", sh_degree=0, stage1_iterations=12), batch_size=4)
+    networks = []
     for count in (1, 4):
         fit(own, count, on_checkpoint=lambda checkpoint: networks.append(checkpoint.state.model.appearance.network))
     alone, together = (jax.tree.map(np.asarray, network) for network in networks)

@@ -47,7 +47,8 @@ def run(spec, name, num_tiles, inputs, results, totals):
     # OpenCL has no empty buffers.
     arrays = [array if array.size else np.zeros(1) for array in (*inputs, *results, *totals)]
     buffers = [cl.Buffer(queue().context, flags, hostbuf=array) for array in arrays]
-    threads, blocks = block_threads(spec.grid.tile_size), num_tiles * num_parts(spec.grid.tile_size)
+    threads = block_threads(spec.grid.tile_size)
+    blocks = num_tiles * num_parts(spec.grid.tile_size)
     _kernel(spec, name)(queue(), (blocks * threads,), (threads,), *buffers)
     found = [np.array(array) for array in (*results, *totals)]
     for array, buffer in zip(found, buffers[len(inputs) :], strict=True):
@@ -59,7 +60,8 @@ def run(spec, name, num_tiles, inputs, results, totals):
 def launch(spec, name, num_tiles, inputs, results, totals=()):
     """Run a kernel on the CPU, with the arguments and results of `kernels.cuda.composite.launch`."""
     _kernel(spec, name)  # Here, for the callback's thread is not in 64-bit mode, and would trace for float32.
-    given, wanted = _kinds([*inputs, *totals]), _kinds([*results, *totals])
+    given = _kinds([*inputs, *totals])
+    wanted = _kinds([*results, *totals])
 
     def call(bits):
         arrays = [
@@ -80,7 +82,8 @@ def evaluate(closed, real, *columns):
     """The results, as float64, of a function of scalars that is printed as C, for each row of some columns."""
     inputs = [Argument(f"x{k}", kind=real) for k in range(len(columns))]
     outputs = [Argument(f"y{k}", kind=C_TYPES[aval.dtype.name]) for k, aval in enumerate(closed.out_avals)]
-    num, header = len(outputs), resources.files(cuda).joinpath("opencl.h").read_text(encoding="utf-8")
+    num = len(outputs)
+    header = resources.files(cuda).joinpath("opencl.h").read_text(encoding="utf-8")
     text = f"""#pragma OPENCL EXTENSION cl_khr_fp64 : enable
     typedef {real} real;
     #define IS_FLOAT {int(real == "float")}

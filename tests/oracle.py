@@ -120,7 +120,9 @@ def rotation_matrix(quat: Float) -> Float:
 def sh_basis(direction: Float) -> Float:
     """[16] real spherical harmonics of 3DGS, in its order and with its signs, at a unit vector: ±√(a/bπ)·polynomial."""
     x, y, z = direction
-    xx, yy, zz = x * x, y * y, z * z
+    xx = x * x
+    yy = y * y
+    zz = z * z
     polynomials = [
         (1, 4, 1),
         (-3, 4, y),
@@ -146,9 +148,12 @@ def lookup(texture: Float, u: Float, v: Float, rules: Rules) -> tuple[Float, Flo
     """Bilinear texel [H, W, 4] of a [Tv, Tu, 4] texture at (u, v), with its margin and kink."""
     rows, columns, _ = texture.shape
     (x, kink_x), (y, kink_y) = texel_position(u, columns, rules), texel_position(v, rows, rules)
-    x0, y0 = np.floor(x).astype(int), np.floor(y).astype(int)
-    x1, y1 = np.minimum(x0 + 1, columns - 1), np.minimum(y0 + 1, rows - 1)
-    fx, fy = (x - x0)[..., None], (y - y0)[..., None]
+    x0 = np.floor(x).astype(int)
+    y0 = np.floor(y).astype(int)
+    x1 = np.minimum(x0 + 1, columns - 1)
+    y1 = np.minimum(y0 + 1, rows - 1)
+    fx = (x - x0)[..., None]
+    fy = (y - y0)[..., None]
     above = (1 - fx) * texture[y0, x0] + fx * texture[y0, x1]
     below = (1 - fx) * texture[y1, x0] + fx * texture[y1, x1]
     texel = (1 - fy) * above + fy * below
@@ -236,7 +241,8 @@ def intersect(
     # By the third column of M instead of the mean; M[2, 2] pixels of the projected mean are one of M[:2, 2].
     by_column3, _ = rho_gradients(rays, M, np.eye(3))
 
-    k, l = rays.k, rays.l  # noqa: E741
+    k = rays.k
+    l = rays.l  # noqa: E741
     summands = abs(k[..., 0] * l[..., 1]) + abs(k[..., 1] * l[..., 0])
     cancellation = abs(rays.p[..., 2]) / np.maximum(summands, np.finfo(float).tiny)
     with np.errstate(invalid="ignore"):
@@ -258,7 +264,8 @@ def intersect(
 
 def homography(scene: Scene, i: int) -> tuple[Float, Float]:
     """M [3, 3] of splat `i`, and ∂M[:, 2]/∂mean."""
-    to_camera, translation = scene.viewmat[:3, :3], scene.viewmat[:3, 3]
+    to_camera = scene.viewmat[:3, :3]
+    translation = scene.viewmat[:3, 3]
     axes = to_camera @ rotation_matrix(scene.quats[i])[:, :2] * np.exp(scene.log_scales[i])
     mean = to_camera @ scene.means[i] + translation
     return scene.K @ np.column_stack([axes, mean]), scene.K @ to_camera
@@ -288,7 +295,8 @@ def shown_layer(scene: Scene, i: int, rules: Rules, hits: Hits, shown: Shown) ->
     """The layer of splat `i`, given where the rays meet it and what it shows there."""
     strength, (M, _) = shown.strength, homography(scene, i)
     is_visible = (strength >= MIN_ALPHA) & (M[2, 2] >= rules.near)
-    direction, normal = view_direction(scene, i), rotation_matrix(scene.quats[i])[:, 2]
+    direction = view_direction(scene, i)
+    normal = rotation_matrix(scene.quats[i])[:, 2]
     facing = direction @ normal
     num_bases = (rules.sh_degree + 1) ** 2
     sh_color = sh_basis(direction)[:num_bases] @ scene.sh[i, :num_bases] + 0.5
@@ -325,10 +333,15 @@ def depth_order(layers: list[Layer]) -> list[int]:
 def composite(layers: list[Layer], background: Float) -> Image:
     """Blends the layers front to back over the background."""
     shape = layers[0].alpha.shape
-    transmittance, is_done = np.ones(shape), np.zeros(shape, bool)
-    color, depth, normal = np.zeros((*shape, 3)), np.zeros(shape), np.zeros((*shape, 3))
+    transmittance = np.ones(shape)
+    is_done = np.zeros(shape, bool)
+    color = np.zeros((*shape, 3))
+    depth = np.zeros(shape)
+    normal = np.zeros((*shape, 3))
     weights = np.zeros((len(layers), *shape))
-    margin, kink, last_depth = np.full(shape, np.inf), np.full(shape, np.inf), np.full(shape, -np.inf)
+    margin = np.full(shape, np.inf)
+    kink = np.full(shape, np.inf)
+    last_depth = np.full(shape, -np.inf)
     for i in depth_order(layers):
         layer = layers[i]
         after = transmittance * (1 - layer.alpha)
@@ -374,7 +387,8 @@ def gradient_statistic(
     behind = image.color.copy()
     statistic = np.zeros((len(layers), 3))
     for i in depth_order(layers):
-        layer, weight = layers[i], image.weights[i][..., None]
+        layer = layers[i]
+        weight = image.weights[i][..., None]
         behind -= weight * layer.color
         is_shown = (image.weights[i] > 0) & ~layer.is_capped
         alpha = np.where(is_shown, layer.alpha, 0.5)[..., None]

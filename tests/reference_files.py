@@ -76,7 +76,8 @@ def load(path: Path) -> Model:
 
 def numbers(model: Model) -> dict[str, np.ndarray]:
     """Numbers that a reader must find, in the order of the file."""
-    textures, shapes = model.textures, model.appearance.shapes
+    textures = model.textures
+    shapes = model.appearance.shapes
     fields = {name: getattr(model.gaussians, name) for name in ("means", "quats", "log_scales", "opacities")}
     found = fields | {"degrees": model.degrees, "sh": model.sh, "sizes": textures.sizes, "texels": textures.flat()}
     if shapes is not None:

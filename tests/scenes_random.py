@@ -237,7 +237,8 @@ def as_gaussians(scene: Scene, dtype: str) -> Gaussians:
 
 def fisheye(camera: Camera) -> Camera:
     """The camera behind an equidistant lens: a pixel at r focal lengths from the middle looks at an angle of r."""
-    K, dtype = np.asarray(camera.K, np.float64), camera.K.dtype
+    K = np.asarray(camera.K, np.float64)
+    dtype = camera.K.dtype
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     places = np.linalg.solve(K, np.stack([x, y, np.ones_like(x)]).reshape(3, -1))[:2]
     angles = np.linalg.norm(places, axis=0)
@@ -287,7 +288,9 @@ def jitted_renderer(settings: RenderSettings) -> Callable[..., RenderOutput]:
 def render_scene(scene: Scene, dtype: str, settings: RenderSettings | None = None) -> RenderOutput:
     """The package's image of a scene, checked to be whole."""
     renderer = jitted_renderer(dataclasses.replace(settings or RenderSettings(), capacity=CAPACITY))
-    gaussians, camera, background = as_gaussians(scene, dtype), as_camera(scene, dtype), scene.background
+    gaussians = as_gaussians(scene, dtype)
+    camera = as_camera(scene, dtype)
+    background = scene.background
     output = renderer(gaussians, camera, as_textures(scene, dtype), jnp.asarray(background, dtype))
     assert not output.overflow
     return output

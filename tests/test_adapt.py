@@ -35,7 +35,10 @@ from a2tg_jax.adapt import most_textures
 from a2tg_jax.core.budget import event_budget
 from a2tg_jax.core.table import Shape, plan_places
 
-ROUND, WIDE, TALL, WIDE_BUT_LARGE = (0.1, 0.1), (0.05, 0.009), (0.009, 0.05), (0.5, 0.02)
+ROUND = (0.1, 0.1)
+WIDE = (0.05, 0.009)
+TALL = (0.009, 0.05)
+WIDE_BUT_LARGE = (0.5, 0.02)
 PAPER = {"k_a": 4.0, "k_s": 0.01, "cap": 4}
 NEXT_SIZES = [
     ((1, 1), ROUND, (2, 2)),
@@ -78,7 +81,8 @@ def added_bytes(sizes, proposed):
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_textures_of_unknown_scales_stay_and_are_never_chosen(bad):
-    sizes, scales = np.array([[2, 1], [0, 0], [1, 1], [2, 2]]), np.full((4, 2), 0.1)
+    sizes = np.array([[2, 1], [0, 0], [1, 1], [2, 2]])
+    scales = np.full((4, 2), 0.1)
     scales[:3, 1] = bad
     scales[1, 0] = np.nan
     proposed = next_sizes(sizes, scales, k_a=4.0, k_s=0.01, cap=4)
@@ -99,7 +103,8 @@ def test_fraction_rounds_halves_up_breaks_ties_by_index_and_leaves_out_the_unsee
         mask = select(np.arange(1.0, 11.0), np.ones((10, 2), int), np.full((10, 2), 2), fraction=fraction)
         np.testing.assert_array_equal(np.flatnonzero(mask), np.arange(10 - num, 10))
     statistic = np.array([0.0, 2.0, 1.0, 1.0, 1.0, 9.0])
-    sizes, proposed = np.ones((6, 2), int), np.full((6, 2), 2)
+    sizes = np.ones((6, 2), int)
+    proposed = np.full((6, 2), 2)
     proposed[5] = 1
     for fraction, wanted in ((0.5, [1, 2, 3]), (1.0, [1, 2, 3, 4])):
         np.testing.assert_array_equal(np.flatnonzero(select(statistic, sizes, proposed, fraction=fraction)), wanted)
@@ -118,7 +123,8 @@ def greedy(statistic, sizes, proposed, budget):
 
 def test_empty_textures_are_chosen_by_every_rule():
     """Three grow from nothing to 2×2, which takes 64 bytes, and one from 1×1, which takes 48."""
-    sizes, statistic = np.array([[0, 0], [0, 0], [0, 0], [1, 1]]), np.array([3.0, 1.0, 0.0, 2.0])
+    sizes = np.array([[0, 0], [0, 0], [0, 0], [1, 1]])
+    statistic = np.array([3.0, 1.0, 0.0, 2.0])
     proposed = next_sizes(sizes, np.full((4, 2), 0.1), **PAPER)
     assert select(statistic, sizes, proposed, threshold=0.5).tolist() == [True, True, False, True]
     assert select(statistic, sizes, proposed, fraction=0.5).tolist() == [True, False, False, True]
@@ -133,7 +139,8 @@ def test_budget_is_the_greedy_choice_and_leaves_less_than_the_cheapest(budget):
         mask = select(statistic, sizes, proposed, budget_bytes=budget)
         np.testing.assert_array_equal(mask, greedy(statistic, sizes, proposed, budget))
         cost = added_bytes(sizes, proposed)
-        left, possible = budget - cost[mask].sum(), cost[~mask & (cost > 0)]
+        left = budget - cost[mask].sum()
+        possible = cost[~mask & (cost > 0)]
         assert left >= 0 and (len(possible) == 0 or left < possible.min())
 
 
@@ -356,7 +363,8 @@ def test_rows_that_do_not_exist_take_no_share(event, statistics):
 
 def test_an_event_of_a_million_takes_seconds():
     """A loop over Gaussians would take minutes; the bound is loose on purpose."""
-    num, rng = 1_000_000, np.random.default_rng(0)
+    num = 1_000_000
+    rng = np.random.default_rng(0)
     textures = allocate_textures(np.ones((num, 2), int))
     scales = np.exp(rng.normal(-5, 1.5, (num, 2)))
     start = time.perf_counter()
@@ -368,7 +376,8 @@ def test_an_event_of_a_million_takes_seconds():
 
 
 def test_statistics_average_over_the_views_that_saw_it():
-    stats, accumulate = GradientStatistics.init(3), jax.jit(GradientStatistics.observe)
+    stats = GradientStatistics.init(3)
+    accumulate = jax.jit(GradientStatistics.observe)
     stats = accumulate(stats, jnp.asarray([1.0, 5.0, jnp.nan]), jnp.asarray([True, True, False]))
     stats = accumulate(stats, jnp.asarray([3.0, 7.0, 0.0]), jnp.asarray([True, False, False]))
     np.testing.assert_array_equal(stats.average(), [2.0, 5.0, 0.0])

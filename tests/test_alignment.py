@@ -50,7 +50,8 @@ def shift(scene, view, other):
     """Mean distance in pixels of what two cameras see of the scene's points."""
 
     def seen(camera):
-        viewmat, K = np.asarray(camera.viewmat), np.asarray(camera.K)
+        viewmat = np.asarray(camera.viewmat)
+        K = np.asarray(camera.K)
         points = (scene.points @ viewmat[:3, :3].T + viewmat[:3, 3]) @ K.T
         return points[:, :2] / points[:, 2:]
 
@@ -73,7 +74,8 @@ def test_scores_with_colours_fitted_do_not_see_an_exposure(scene, model):
     """Photographs under another exposure have the same scores, up to the rounding to 8 bits, but only with the fit."""
     views = scene.test
     darker = tuple(dataclasses.replace(view, picture=(view.image * 0.6 + 20).astype(np.uint8)) for view in views)
-    plain, fitted = evaluate(views, model), evaluate(views, model, fit_colors=True)
+    plain = evaluate(views, model)
+    fitted = evaluate(views, model, fit_colors=True)
     assert fitted.psnr > plain.psnr
     again = evaluate(darker, model, fit_colors=True)
     assert again.psnr + 20 * np.log10(0.6) == pytest.approx(fitted.psnr, abs=0.4)

@@ -90,7 +90,8 @@ def test_main_names_have_an_example():
 
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_every_argument_and_result_is_described(name):
-    text, signature = inspect.getdoc(FUNCTIONS[name]), inspect.signature(FUNCTIONS[name])
+    text = inspect.getdoc(FUNCTIONS[name])
+    signature = inspect.signature(FUNCTIONS[name])
     described = re.findall(r"^  \*{0,2}(\w+): ", text.partition("Args:\n")[2].partition("\n\n")[0], re.MULTILINE)
     assert described == list(signature.parameters)
     assert ("\nReturns:\n" in text) == (signature.return_annotation not in (None, "None"))
@@ -143,7 +144,8 @@ def test_every_field_is_described():
 
 
 def test_docstrings_name_nothing_private():
-    private, found = private_names(), set()
+    private = private_names()
+    found = set()
     modules = {path.stem for path in PACKAGE.rglob("*.py")} | {path.name for path in PACKAGE.iterdir()}
     modules -= members() | PUBLIC.keys()
     for name, text in documented():

@@ -116,7 +116,8 @@ def test_floats_of_a_splat():
 )
 def test_appearances_start_colourless_and_as_opaque_as_their_gaussians_or_half(template, size, opacity):
     scene = hand_scene([[0.1, 0.1, 4]], [FACING], [[size, size]], [0.6], [[0.2, 0.5, 0.7]])
-    gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
+    gaussians = as_gaussians(scene, "float32")
+    camera = as_camera(scene, "float32")
     appearance = allocate_appearance(template, KEY, gaussians)
     output = render_appearance(gaussians, camera, appearance)
     # The ray of this pixel meets the mean.
@@ -131,7 +132,8 @@ def test_billboards_end_one_texel_beyond_the_border(side):
     """By hand: u runs from −1 to 1 over 8 pixels, 8/(S − 1) from texel to texel; the fade takes as many more."""
     scale = 8 / 2 * 4 / FOCAL
     scene = hand_scene([[0, 0, 4]], [FACING], [np.log([scale, 10 * scale])], [0.5], [[1, 1, 1]])
-    gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
+    gaussians = as_gaussians(scene, "float32")
+    camera = as_camera(scene, "float32")
     pictures = allocate_appearance(billboards(side=side), KEY, gaussians).pictures
     pictures = dataclasses.replace(pictures, buckets=(pictures.buckets[0].at[..., 3].set(0.8),))
     alpha = render_appearance(gaussians, camera, billboards(pictures=pictures, side=side)).alpha[6]

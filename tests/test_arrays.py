@@ -138,7 +138,8 @@ def test_poses_of_another_convention_are_named(given, advice, has_points):
 def room(camera, radius=3.0):
     """What a camera in a sphere sees: smooth waves on its wall, whose rays are intersected here."""
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    viewmat, K = np.asarray(camera.viewmat, float), np.asarray(camera.K, float)
+    viewmat = np.asarray(camera.viewmat, float)
+    K = np.asarray(camera.K, float)
     rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(K).T @ viewmat[:3, :3]
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     center = -viewmat[:3, :3].T @ viewmat[:3, 3]
@@ -279,7 +280,8 @@ def test_a_transparent_photograph_is_compared_on_the_background_of_the_model():
     images = [np.zeros((12, 16, 4), np.uint8)] * 2
     scene = a2tg.scene_from_arrays(images, [each.viewmat for each in cameras], cameras[0].K, 0.1 * np.eye(4, 3))
     hidden = a2tg.init_from_points(scene.points, scene.colors, opacity=1e-4)
-    model, view = a2tg.Model(hidden, background=(1.0, 1.0, 1.0)), scene.train[0]
+    model = a2tg.Model(hidden, background=(1.0, 1.0, 1.0))
+    view = scene.train[0]
     assert a2tg.psnr(model.render(view.camera).color, a2tg.view_image(view, model.background)) > 50
     with pytest.warns(UserWarning, match=r"transparent and was put on black: use view_image\(view, model.background\)"):
         assert not np.asarray(a2tg.view_image(view)).any()

@@ -82,7 +82,8 @@ def split_splats(model: Model, growth: float = 2.0) -> Model:
 
 def kernel_at(log_exponent: float, rho: np.ndarray) -> np.ndarray:
     """exp(−((ρ + ε)^β − ε^β) / ((2 + ε)^β − ε^β)) for ε = 0.02: 1 at the centre, 1/e at √2 standard deviations."""
-    beta, epsilon = np.exp(log_exponent), 0.02
+    beta = np.exp(log_exponent)
+    epsilon = 0.02
     start = epsilon**beta
     return np.exp(-((rho + epsilon) ** beta - start) / ((2 + epsilon) ** beta - start))
 
@@ -106,7 +107,8 @@ def test_kernels_add_up_to_the_gaussian(num, options):
 @pytest.mark.parametrize("extent", [0.01, 0.5, 1.5, 20.0])
 def test_kernels_have_the_mean_and_the_variance_of_their_texels(extent):
     """By scipy's quadrature, piece by piece; texels far outside are somewhere, with a size."""
-    options, num = TextureOptions(outside="identity", extent=extent), 4
+    options = TextureOptions(outside="identity", extent=extent)
+    num = 4
     means, scales = kernels(num, options)
     assert np.isfinite(means).all() and (scales > 0).all() and (np.diff(means) > 0).all()
     centers = extent * np.array([-0.75, -0.25, 0.25, 0.75])
@@ -129,7 +131,8 @@ def test_kernels_have_the_mean_and_the_variance_of_their_texels(extent):
 
 @pytest.mark.parametrize("outside", ["clamp", "identity"])
 def test_textures_of_another_extent_become_splats_where_they_are_shown(outside):
-    model, options = textured(), TextureOptions(outside=outside, extent=1.5)
+    model = textured()
+    options = TextureOptions(outside=outside, extent=1.5)
     texture = dataclasses.replace(model.appearance.texture, options=options)
     model = dataclasses.replace(model, appearance=dataclasses.replace(model.appearance, texture=texture))
     found = split_splats(model)
@@ -161,7 +164,8 @@ def test_the_nearest_gaussian_has_the_least_squared_difference(log_exponent):
     gaussians = dataclasses.replace(some_gaussians(1), logit_opacities=jnp.zeros(1))
     shapes = jnp.arctanh(jnp.clip(jnp.asarray([log_exponent]), -1 + 1e-7, 1))
     found = split_splats(Model(gaussians, Appearance(exponents=Exponents(shapes)))).gaussians
-    peak, factor = 2 * float(found.opacities[0]), float(jnp.exp(found.log_scales - gaussians.log_scales)[0, 0])
+    peak = 2 * float(found.opacities[0])
+    factor = float(jnp.exp(found.log_scales - gaussians.log_scales)[0, 0])
     rho = np.linspace(0, 144, 100_001)
     kernel = kernel_at(log_exponent, rho)
     difference = lambda a, k: np.mean((a * np.exp(-rho / 2 / k) - kernel) ** 2)  # noqa: E731
@@ -171,7 +175,8 @@ def test_the_nearest_gaussian_has_the_least_squared_difference(log_exponent):
 
 
 def test_texels_are_kept_where_pictures_need_them():
-    even, striped = np.ones((4, 4, 4), np.float32), np.ones((4, 4, 4), np.float32)
+    even = np.ones((4, 4, 4), np.float32)
+    striped = np.ones((4, 4, 4), np.float32)
     striped[:, ::2, :3] = 0.2
     textures = textures_from_arrays([even, striped, striped])
     weights = tuple(jnp.ones_like(bucket).at[2].set(1e-6) for bucket in textures.buckets)
@@ -248,7 +253,9 @@ def test_convert_bakes(tmp_path, capsys):
 
 def test_a_bake_of_a_run_is_kept(tmp_path, monkeypatch, capsys):
     """It is used again for the same model and options only."""
-    run, model, baked = create_run(tmp_path / "run"), textured(), []
+    run = create_run(tmp_path / "run")
+    model = textured()
+    baked = []
     system = A2tg(stage1_iterations=1, stage2_iterations=1)
     write_record(run, RunRecord(SceneSource("/scene"), "a2tg", system))
     save_model(run.own(run.model("a2tg-textures")), model)
@@ -264,7 +271,8 @@ def test_a_bake_of_a_run_is_kept(tmp_path, monkeypatch, capsys):
         assert main(words) == 0
         return capsys.readouterr().out.splitlines()[0]
 
-    first, again = converts("a.ply"), converts("b.npz")
+    first = converts("a.ply")
+    again = converts("b.npz")
     assert again == f"{first}; kept in {run.baked('a2tg-textures')}" and len(baked) == 1
     assert load_splats(tmp_path / "b.npz").num == load_splats(tmp_path / "a.ply").num
     converts("c.ply", "--bake-growth", "1.5")

@@ -32,7 +32,8 @@ def draw(size: tuple[int, int], count: int = 200):
 @pytest.mark.parametrize("size", SIZES)
 def test_values_are_those_of_scipy_and_slopes_are_differences(x64, size):
     texels, x, y = draw(size)
-    found, eps = sample(texels, x, y), 1e-7
+    found = sample(texels, x, y)
+    eps = 1e-7
     np.testing.assert_allclose(found.values[0], map_coordinates(texels, [y, x], order=1), atol=1e-12)
     ends = np.float64([0, size[1] - 1]), np.float64([0, size[0] - 1])
     at_ends = map_coordinates(texels, ends[::-1], order=1)

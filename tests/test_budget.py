@@ -103,11 +103,13 @@ def test_a_budget_is_one_value_however_it_comes(name, tmp_path):
 def test_events_double_at_most_and_the_last_leaves_the_cap(seed):
     rng = np.random.default_rng(seed)
     for _ in range(40):
-        count, start = int(rng.integers(1, 60)), int(rng.integers(2, 200_000))
+        count = int(rng.integers(1, 60))
+        start = int(rng.integers(2, 200_000))
         cap = int(min(start * rng.uniform(1, 2) ** count, 3e6))
         num = start
         for left in range(count, 0, -1):
-            before, num = num, int(number_to_reach(jnp.asarray(num, jnp.int32), cap, left))
+            before = num
+            num = int(number_to_reach(jnp.asarray(num, jnp.int32), cap, left))
             assert before <= num <= min(2 * before, cap)
         assert num == cap
 
@@ -117,7 +119,8 @@ def test_monte_carlo_growth_leaves_the_cap(x64, dtype, num_iterations, count):
     """From few Gaussians, at the times that a stage of so many iterations has."""
     model = random_model(0, 300, 4, np.tile([0.5, 0.003], 150))
     model = jax.tree.map(lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, model)
-    event, moments = FillingMcmc(300), adam_init(partition(model)[0])
+    event = FillingMcmc(300)
+    moments = adam_init(partition(model)[0])
     times = event.times(num_iterations)
     apply = jax.jit(
         lambda iteration, left, *rest: event.apply(some_now(iteration, num_iterations, left, num_keys=2), *rest, ())
@@ -144,7 +147,9 @@ def test_caps_use_up_every_budget(name):
         assert needed * filling(system).cap <= system.budget_bytes < needed * (filling(system).cap + 1)
 
 
-ROUND, WIDE, TALL = (0.1, 0.1), (0.05, 0.009), (0.009, 0.05)
+ROUND = (0.1, 0.1)
+WIDE = (0.05, 0.009)
+TALL = (0.009, 0.05)
 SHAPES = {"round": (ROUND, ROUND), "thin": (WIDE, TALL), "mixed": (WIDE, ROUND)}
 
 
@@ -170,7 +175,8 @@ def test_textures_take_what_gaussians_leave(budget, shape, texture_cap, rounds):
         sums = jnp.asarray(rng.exponential(size=num) * rng.integers(0, 2, num), jnp.float32)
         state = GradientStatistics(sums, jnp.ones(num, jnp.int32))
         change = upscale.apply(Due(index + 1, rounds), model, moments, state)
-        model, moments = change.model, change.moments
+        model = change.model
+        moments = change.moments
     assert 0.995 * system.budget_bytes <= model.num_bytes <= system.budget_bytes
     if texture_cap > 2:
         assert system.budget_bytes - model.num_bytes < 16 * (4 * 4 - 2 * 2), "less than what one texture would cost"
@@ -203,7 +209,8 @@ def test_density_control_reaches_its_cap_whatever_is_pruned(faint):
         opaque = np.flatnonzero((opacities >= 0.05) & (np.arange(num) < num_live))
         assert set(opaque) <= set(kept) and kept.max() < num_live and int(num_refused) == 0
         assert len(kept) == max(len(opaque), (wanted + 1) // 2)
-        spared, gone = np.setdiff1d(kept, opaque), np.setdiff1d(np.arange(num_live), kept)
+        spared = np.setdiff1d(kept, opaque)
+        gone = np.setdiff1d(np.arange(num_live), kept)
         assert not (len(spared) and len(gone)) or opacities[spared].min() >= opacities[gone].max()
         assert set(doubled) <= set(kept)
         rest = np.setdiff1d(kept, doubled)

@@ -196,7 +196,8 @@ def test_compared_with_another_system_it_keeps_its_degrees():
 
 def test_compared_with_a2tg_both_keep_their_kernels_and_shares():
     """Options of the same names, which mean nothing for the other."""
-    own, textured = Bytewise.preset("quick"), a2tg.A2tg.preset("quick", kernel_rate=0.02, texture_share=0.3)
+    own = Bytewise.preset("quick")
+    textured = a2tg.A2tg.preset("quick", kernel_rate=0.02, texture_share=0.3)
     compared = compared_system("bytewise", textured, "quick")
     assert (compared.kernel_rate, compared.texture_share) == (own.kernel_rate, own.texture_share)
     compared = compared_system("a2tg", own, "quick")

@@ -217,7 +217,8 @@ def rig_xml(in_rig, sensors=("",), master=0):
       sensors: further elements of both sensors, or of the second.
       master: number of the camera of each rig that has the pose.
     """
-    rotation, translation = numbers(in_rig[:3, :3]), numbers(in_rig[:3, 3])
+    rotation = numbers(in_rig[:3, :3])
+    translation = numbers(in_rig[:3, 3])
     size = f'<resolution width="{WIDTH}" height="{HEIGHT}"/>'
     lens = f'<calibration type="frame" class="adjusted">{size}<f>100</f><b1>-4</b1></calibration>'
     place = f"<rotation>{rotation}</rotation><translation>{translation}</translation>"

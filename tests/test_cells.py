@@ -10,7 +10,8 @@ ITERATIONS = {"stage1_iterations": 1000, "stage2_iterations": 1000}
 
 def plain_and_textured(sh_degree):
     """Return the metrics on test views after equally many iterations in equal bytes."""
-    scene, found = a2tg.cells_scene(), []
+    scene = a2tg.cells_scene()
+    found = []
     for kind in (a2tg.Gaussians2dMcmc, a2tg.A2tg):
         system = kind.preset("quick", memory_budget=BUDGET, sh_degree=sh_degree, **ITERATIONS)
         model = a2tg.fit(scene, system, progress=False).model

@@ -92,7 +92,8 @@ def test_pytrees_may_hold_anything():
 def test_a_moved_model_renders_the_same_with_moved_settings():
     near = a2tg.Camera(jnp.eye(4).at[2, 3].set(0.7), CAMERA.K, 16, 12)
     model = dataclasses.replace(a2tg.Model(some_gaussians(40)), origin=a2tg.Origin.of_cameras([near]))
-    world, settings = dataclasses.replace(some_world(), scale=0.2), SETTINGS
+    world = dataclasses.replace(some_world(), scale=0.2)
+    settings = SETTINGS
     moved = model.transform(world)
     (camera,) = moved.origin.cameras
     shown = model.render(near, settings=settings).color

@@ -34,7 +34,8 @@ CAMERA = a2tg.Camera(jnp.eye(4).at[2, 3].set(2.0), jnp.asarray([[30.0, 0, 8], [0
 def one_splat(color=0.5):
     """A splat whose texture fills the image of `CAMERA`."""
     sh = jnp.zeros((1, 1, 3)).at[0, 0].set((color - 0.5) / SH_C0)
-    means, quats = jnp.zeros((1, 3)), jnp.asarray([[1.0, 0, 0, 0]])
+    means = jnp.zeros((1, 3))
+    quats = jnp.asarray([[1.0, 0, 0, 0]])
     return a2tg.Gaussians(means, quats, jnp.full((1, 2), np.log(0.25)), jnp.full(1, 3.0), sh)
 
 
@@ -154,7 +155,8 @@ def test_alphas_at_their_cap_can_fade():
 
 
 def test_exponents_at_their_limit_have_a_gradient():
-    gaussians, settings = some_gaussians(5), a2tg.RenderSettings(capacity=1024)
+    gaussians = some_gaussians(5)
+    settings = a2tg.RenderSettings(capacity=1024)
     limit = jnp.full(5, np.arctanh(np.log(0.6) / LARGEST_LOG_EXPONENT), jnp.float32)
     camera = a2tg.Camera(jnp.eye(4).at[2, 3].set(4.0), CAMERA.K, 16, 16)
 

@@ -185,7 +185,8 @@ def test_what_comes_back_looks_the_same(name):
 def test_coders_do_not_change_what_comes_back(coder):
     model = banded(0, textured(True))
     data = compact_bytes(model, CompactChoices(coder=coder))
-    wanted, found = model_in(compact_bytes(model, CompactChoices(coder="none"))), model_in(data)
+    wanted = model_in(compact_bytes(model, CompactChoices(coder="none")))
+    found = model_in(data)
     assert len(compact_bytes(model)) < len(data) or coder == "smallest"
     assert jax.tree.structure(found) == jax.tree.structure(wanted)
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
@@ -198,7 +199,8 @@ def test_errors_are_half_a_step_at_most(precision):
     for group in ("log_scales", "opacities", "sh_0", "sh_rest", "shapes"):
         found = model_in(compact_bytes(model, EXACT.keeping({group: precision})))
         order = order_of(model, found)
-        wanted, values = tables(model, order), tables(found)
+        wanted = tables(model, order)
+        values = tables(found)
         assert np.abs(values[group] - wanted[group]).max() <= half_step(wanted[group], precision)
         for other in set(wanted) - {group}:
             np.testing.assert_array_equal(values[other], wanted[other])
@@ -207,7 +209,8 @@ def test_errors_are_half_a_step_at_most(precision):
 def test_errors_of_files_for_browsers_are_half_a_step_at_most():
     model = banded(0, shaped(textured(True)))
     found = model_in(encode_web_scene(model))
-    wanted, values = tables(model, order_of(model, found)), tables(found)
+    wanted = tables(model, order_of(model, found))
+    values = tables(found)
     for group in ("log_scales", "opacities", "sh_0", "sh_rest", "shapes"):
         assert np.abs(values[group] - wanted[group]).max() <= half_step(wanted[group], 6 if group == "sh_rest" else 8)
     for exact in ("degrees", "sizes"):
@@ -233,7 +236,8 @@ def test_rotations_are_within_the_diagonal_of_a_step(bits):
     turned = np.stack([(rotations * turn).as_quat(canonical=True, scalar_first=True) for turn in turns])
     axis = np.argmax(turned[:, :, 0], axis=0)
     quats = turned[axis, np.arange(NUM)]
-    wanted, step = quats[:, 1:], np.ptp(quats[:, 1:]) / (2**bits - 2)
+    wanted = quats[:, 1:]
+    step = np.ptp(quats[:, 1:]) / (2**bits - 2)
     # w follows from the others, which change it by three times as much at most: it is no smaller than they are.
     assert np.abs(np.asarray(found.gaussians.quats)[:, 1:] - wanted).max() <= 2 * step + 1e-6
     assert np.linalg.norm(np.asarray(found.gaussians.quats) - quats, axis=1).max() <= 3 * step + 1e-6
@@ -245,7 +249,8 @@ def test_means_are_within_a_step_that_grows_with_the_distance(bits):
     means = np.random.default_rng(0).standard_t(2, size=(3, 400)).astype(np.float32) * 5
     gaussians = dataclasses.replace(some_gaussians(400), means=jnp.asarray(means.T), logit_opacities=jnp.arange(400.0))
     decoded = model_in(compact_bytes(Model(gaussians), EXACT.keeping({"means": bits}))).gaussians
-    found, order = np.asarray(decoded.means).T, np.asarray(decoded.logit_opacities).astype(int)
+    found = np.asarray(decoded.means).T
+    order = np.asarray(decoded.logit_opacities).astype(int)
     for axis, values in zip(means[:, order], found, strict=True):
         center = np.median(axis)
         spread = np.quantile(np.abs(axis - center), 0.75)
@@ -326,7 +331,8 @@ def test_shapes_of_any_precision_are_finite(bits):
     shapes = jnp.asarray(np.resize([-30.0, 30.0, 0.0, 0.3], NUM), jnp.float32)
     model = dataclasses.replace(model, appearance=model.appearance.with_shapes(shapes))
     found = model_in(compact_bytes(model, CompactChoices(shapes=bits)))
-    wanted, values = tables(model, order_of(model, found))["shapes"], tables(found)["shapes"]
+    wanted = tables(model, order_of(model, found))["shapes"]
+    values = tables(found)["shapes"]
     assert np.abs(values - wanted).max() <= {1: 1.0, 2: 0.5}.get(bits, half_step(wanted, max(bits, 2))) + 1e-6
 
 
@@ -586,14 +592,16 @@ def test_the_viewer_opens_at_a_central_training_camera():
 @pytest.mark.long
 def test_textures_are_kept_as_they_are_seen():
     """The authors' conventions clip residuals and divide alpha: the file holds what is left, and says where to look."""
-    options, base = TextureOptions.official(), textured()
+    options = TextureOptions.official()
+    base = textured()
     texture = dataclasses.replace(base.appearance.texture, options=options)
     model = dataclasses.replace(base, appearance=dataclasses.replace(base.appearance, texture=texture))
     found = model_in(encode_web_scene(model))
     assert found.appearance.texture_options == dataclasses.replace(options, rgb="signed", alpha="projected")
     shown = dataclasses.replace(texture, texels=texture.shown())
     model = dataclasses.replace(model, appearance=dataclasses.replace(model.appearance, texture=shown))
-    wanted, texels = tables(model, order_of(model, found))["texels"], found.textures.flat()
+    wanted = tables(model, order_of(model, found))["texels"]
+    texels = found.textures.flat()
     np.testing.assert_allclose(tables(found)["texels"], wanted, atol=half_step(texels, 8))
     assert texels.min() >= 0 and texels[:, 3].max() <= 1 + 1e-6
 
@@ -603,7 +611,8 @@ def test_chunks_that_show_most_come_first():
     scales = jnp.asarray(np.random.default_rng(0).normal(size=(model.num, 2)), jnp.float32)
     model = dataclasses.replace(model, gaussians=dataclasses.replace(model.gaussians, log_scales=scales))
     data = encode_web_scene(model)
-    chunk, weights = taken_apart(data)[0]["chunk"], importance(model_in(data))
+    chunk = taken_apart(data)[0]["chunk"]
+    weights = importance(model_in(data))
     first, *rest = (weights[start : start + chunk] for start in range(0, model.num, chunk))
     assert len(rest) == 3 and first.min() > 0.9 * rest[0].max() > 0.9 * rest[1].max() > 0
     assert {coder for _, coder, _ in taken_apart(encode_web_scene(model, coder="none"))[0]["parts"]} == {"none"}
@@ -625,7 +634,8 @@ def test_the_reference_reader_finds_the_numbers(reference, tmp_path, name):
     model = MODELS[name]()
     model = concatenate([model] * 40) if model.textures is None else model
     (tmp_path / "a.a2tgz").write_bytes(encode_web_scene(model))
-    found, wanted = reference[0](tmp_path / "a.a2tgz"), load_compact(tmp_path / "a.a2tgz")
+    found = reference[0](tmp_path / "a.a2tgz")
+    wanted = load_compact(tmp_path / "a.a2tgz")
     assert len(found["means"]) == wanted.num
     np.testing.assert_allclose(found["means"], wanted.gaussians.means, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(found["sh"][:, : wanted.sh.shape[1]], wanted.sh, atol=1e-5)

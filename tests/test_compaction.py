@@ -47,7 +47,8 @@ def test_losses_are_differences_of_psnr_and_of_renders():
     model = a_model()
     spoiled = dataclasses.replace(model, gaussians=dataclasses.replace(model.gaussians, sh=model.gaussians.sh + 0.3))
     wanted = evaluate(SCENE.train, model).psnr - evaluate(SCENE.train, spoiled).psnr
-    loss, cameras = loss_on_views(model, SCENE.train), model.origin.cameras[:2]
+    loss = loss_on_views(model, SCENE.train)
+    cameras = model.origin.cameras[:2]
     assert loss(spoiled) == pytest.approx(wanted, abs=1e-3) and abs(wanted) > 0.05 and loss(model) == 0
     # Without photographs, errors add up.
     loss = loss_beside_renders(model, cameras, assumed_psnr=20.0)

@@ -90,13 +90,15 @@ def test_compress_with_tuning(run, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(compression, "TUNED_LADDER", ladder)
     monkeypatch.setattr(tuning, "MOST_TUNINGS", 1)
     monkeypatch.setattr(reports, "TIMED_SECONDS", 0.0)
-    plain, tuned = tmp_path / "plain.a2tgz", tmp_path / "tuned.a2tgz"
+    plain = tmp_path / "plain.a2tgz"
+    tuned = tmp_path / "tuned.a2tgz"
     with monkeypatch.context() as patch:
         patch.setattr(compression, "smallest_tuned", lambda *a: tuning.TunedFiles([]))
         assert cli.main([*TUNE, str(run.path), "--out", str(plain), "--max-loss", "0.02"]) == 0
     capsys.readouterr()
     assert cli.main([*TUNE, str(run.path), "--out", str(tuned), "--max-loss", "0.02"]) == 0
-    printed, scene = capsys.readouterr().out, read_record(run).scene.load()
+    printed = capsys.readouterr().out
+    scene = read_record(run).scene.load()
     assert re.search(r"\ntuning 1 of up to 4: .*, about 0:\d\d:\d\d left\n", printed)  # Nothing grows.
     assert "then training up to" in printed and "\ntuned 1 " in printed and "\ntuned 1: means " in printed
     before, after = (
@@ -111,7 +113,9 @@ def test_compress_within_a_file_budget(run, tmp_path, monkeypatch, capsys):
     ladder = {"means": (5, 8, 14), "log_scales": (2, 4, 10), "sh_0": (2, 4, 10), "opacities": (2, 4, 10)}
     monkeypatch.setattr(compression, "LADDER", ladder)
     monkeypatch.setattr(compression, "TUNED_LADDER", ladder)
-    scene, path, losses = read_record(run).scene.load(), run.model("a2tg-textures"), []
+    scene = read_record(run).scene.load()
+    path = run.model("a2tg-textures")
+    losses = []
     for name, flags in {"plain": (), "tuned": ("--tune-iterations", "30")}.items():
         out = tmp_path / f"{name}.a2tgz"
         assert cli.main(["compress", str(run.path), "--out", str(out), "--file-budget", "2.3kB", *flags]) == 0

@@ -74,7 +74,8 @@ def test_derivatives_of_a_moved_camera(x64):
     def value(twist):
         return jnp.sum(weights * jnp.sin(moved_viewmat(twist, jnp.asarray(viewmat))))
 
-    step, values = 1e-6, jax.jit(jax.vmap(value))
+    step = 1e-6
+    values = jax.jit(jax.vmap(value))
     backwards, forwards, hessian = (jax.jit(of(value)) for of in (jax.grad, jax.jacfwd, jax.hessian))
     for angle in (0.0, 1e-7, 0.0999, 0.1001, 2.0):
         twist = jnp.asarray([*(angle * AXIS), 0.1, -0.2, 0.3])
@@ -103,7 +104,8 @@ def test_only_views_that_are_seen_learn(x64):
     """Rows follow Adam as if each were alone; a view that occurs twice is stepped once."""
     correction = PoseRefinement(rate=1e-2, final_factor=1.0)
     (state,) = initial_corrections((correction,), ["a", "b", "c"], None, jnp.float64)
-    alone, moments = jnp.zeros(6), adam_init(jnp.zeros(6))
+    alone = jnp.zeros(6)
+    moments = adam_init(jnp.zeros(6))
     for seed in range(3):
         grad = jnp.asarray(np.random.default_rng(seed).normal(size=(2, 6)))
         state = updated(correction, state, jnp.asarray([1, 1]), grad, jnp.asarray(0.5))

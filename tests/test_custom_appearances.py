@@ -77,7 +77,8 @@ class Painted(Appearance):
 
     def shade(self, numbers, values, u, v):
         code, *weights = numbers
-        first, last = weights[:9], weights[9:]
+        first = weights[:9]
+        last = weights[9:]
         neurons = [jnp.tanh(first[i] * u + first[i + 1] * v + first[i + 2] * code) for i in (0, 3, 6)]
         outputs = [sum(last[3 * i + color] * neuron for i, neuron in enumerate(neurons)) for color in range(3)]
         return (outputs[0],) * 3, None, tuple(1 + output for output in outputs)
@@ -162,7 +163,8 @@ some_long = [pytest.param(name, marks=[] if name in FAST else pytest.mark.long) 
 
 def rendered(scene, appearance, compositor="auto", dtype="float64"):
     background = jnp.asarray(scene.background, dtype)
-    camera, settings = as_camera(scene, dtype), RenderSettings(compositor=compositor)
+    camera = as_camera(scene, dtype)
+    settings = RenderSettings(compositor=compositor)
     return render_appearance(as_gaussians(scene, dtype), camera, appearance, background=background, settings=settings)
 
 
@@ -176,7 +178,8 @@ def expected_image(case: Case, scene, arrays) -> oracle.Image:
 @pytest.mark.parametrize("compositor", ["native", pytest.param("xla", marks=pytest.mark.long)])
 @pytest.mark.parametrize("name", CASES)
 def test_float64(name, compositor):
-    case, scene = CASES[name], draw_scene(4)
+    case = CASES[name]
+    scene = draw_scene(4)
     arrays = case.arrays(scene)
     expected = expected_image(case, scene, arrays)
     assert expected.margin.min() > 1e-9 and expected.alpha.max() > 0.9
@@ -188,7 +191,8 @@ def test_float64(name, compositor):
 @pytest.mark.parametrize("name", some_long)
 def test_float32(name):
     """As the textures' test of float32."""
-    case, scene = CASES[name], draw_scene(4)
+    case = CASES[name]
+    scene = draw_scene(4)
     expected = expected_image(case, scene, case.arrays(scene))
     is_compared = expected.margin > 1e-4
     assert is_compared.mean() > 0.95
@@ -204,7 +208,8 @@ def expected_gradients(name: str):
     numbers may depend."""
     case = CASES[name]
     scene = draw_smooth_scene(case.smooth_seed)
-    arrays, weights = case.arrays(scene), draw_weights(scene)
+    arrays = case.arrays(scene)
+    weights = draw_weights(scene)
     image = expected_image(case, scene, arrays)
     assert min(image.margin.min(), image.kink.min()) > CLEARANCE
 
@@ -226,7 +231,8 @@ def expected_gradients(name: str):
 def test_every_leaf_against_differences(name, compositor):
     case = CASES[name]
     scene = draw_smooth_scene(case.smooth_seed)
-    weights, background = draw_weights(scene), jnp.asarray(scene.background)
+    weights = draw_weights(scene)
+    background = jnp.asarray(scene.background)
 
     def loss(arrays, gaussians, viewmat):
         camera = Camera(viewmat, jnp.asarray(scene.K), scene.width, scene.height)
@@ -251,7 +257,8 @@ def test_every_leaf_against_differences(name, compositor):
 )
 def test_gpu_kernels_are_those_of_xla(name):
     # In this scene no splat is seen so edge-on that v² would leave float32 three digits.
-    case, scene = CASES[name], draw_scene(1, num=16, width=19, height=13)
+    case = CASES[name]
+    scene = draw_scene(1, num=16, width=19, height=13)
 
     def loss(arrays, gaussians, compositor):
         settings = RenderSettings(compositor=compositor)
@@ -275,14 +282,16 @@ def test_the_statistic_takes_the_way_of_the_falloff(compositor):
     arrays = random_arrays("glossy", len(scene.means))
     arrays["colors"][:] = 0
     settings = RenderSettings(compositor=compositor, capacity=1024, sh_degree=0)
-    camera, background = as_camera(scene, "float64"), jnp.zeros(3)
+    camera = as_camera(scene, "float64")
+    background = jnp.zeros(3)
 
     def loss(gaussians, probe, appearance):
         output, _ = render_traced(gaussians, camera, appearance, background, settings, has_geometry=False, probe=probe)
         return jnp.sum(output.color)
 
     differentiate = jax.jit(jax.grad(loss, argnums=(0, 1)))
-    gaussians, probe = as_gaussians(scene, "float64"), jnp.zeros((len(scene.means), 4))
+    gaussians = as_gaussians(scene, "float64")
+    probe = jnp.zeros((len(scene.means), 4))
     by_mean, statistic = differentiate(gaussians, probe, glossy(arrays))
     assert jnp.max(jnp.abs(by_mean.means)) > 1e-2
     np.testing.assert_allclose(statistic[:, :3], jnp.abs(by_mean.means), atol=1e-12)

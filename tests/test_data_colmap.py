@@ -73,7 +73,8 @@ def write_scene(folder, *, models=("PINHOLE",), num_views=9, num_points=50, text
 
 def project(camera, points):
     """Pixels [P, 2] of world points, in float64."""
-    viewmat, K = np.asarray(camera.viewmat, np.float64), np.asarray(camera.K, np.float64)
+    viewmat = np.asarray(camera.viewmat, np.float64)
+    K = np.asarray(camera.K, np.float64)
     homogeneous = (points @ viewmat[:3, :3].T + viewmat[:3, 3]) @ K.T
     return homogeneous[:, :2] / homogeneous[:, 2:]
 
@@ -165,7 +166,8 @@ def test_alpha_and_greyscale(tmp_path):
     np.testing.assert_allclose(seen, expected, atol=1e-6)
 
 
-FOURTH, MODEL = "images/img_04.png", "sparse/0"
+FOURTH = "images/img_04.png"
+MODEL = "sparse/0"
 
 
 def put(file, data):
@@ -175,7 +177,8 @@ def put(file, data):
 def as_panoramas(folder):
     reconstruction = pycolmap().Reconstruction(str(folder / MODEL))
     for camera in reconstruction.cameras.values():
-        camera.model, camera.params = pycolmap().CameraModelId.EQUIRECTANGULAR, [WIDTH, HEIGHT]
+        camera.model = pycolmap().CameraModelId.EQUIRECTANGULAR
+        camera.params = [WIDTH, HEIGHT]
     reconstruction.write_binary(str(folder / MODEL))
 
 

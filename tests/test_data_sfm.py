@@ -197,7 +197,8 @@ def test_colmap_reads_and_writes_every_photograph(tmp_path, name, mode, options)
 def test_transparent_photographs_are_staged_as_png(tmp_path):
     """With straight colours and alpha, upright."""
     pixels = np.dstack([COLOUR, np.where(np.arange(96) < 40, 0, 255) * np.ones((64, 1))]).astype(np.uint8)
-    photos, image = tmp_path / "photos", Image.fromarray(pixels)
+    photos = tmp_path / "photos"
+    image = Image.fromarray(pixels)
     photos.mkdir()
     for name in ("0.png", "1.tif", "3.PNG"):
         image.save(photos / name)
@@ -219,7 +220,8 @@ def test_alpha_and_masks_are_undistorted_with_the_photographs(tmp_path):
     """An alpha channel and a mask of the dot alone are where COLMAP's undistorted photograph shows the dot."""
     names = ["a/0.png", "a/1.PNG", "b/2.jpg", "b/3.png"]
     model = write_colmap(tmp_path / "scene", models=("SIMPLE_RADIAL", "OPENCV"), num_views=4, names=names)
-    photos, out = tmp_path / "scene" / "images", tmp_path / "out"
+    photos = tmp_path / "scene" / "images"
+    out = tmp_path / "out"
     for name in names:
         photograph = read_pixels(photos / name)
         is_dot = photograph[..., 0] > 20
@@ -344,7 +346,8 @@ def test_masks_of_panoramas_are_cut(tmp_path):
     for name, mask, alpha in (("up", 0, None), ("down", 255, None), ("heading300", None, 0)):
         file = f"{rig.folder}/{name}/0.png"
         side = rig.groups[0].size[0]
-        pixels, counts = read_pixels(found.folder / file), read_pixels(tmp_path / "work" / "masks" / f"{file}.png")
+        pixels = read_pixels(found.folder / file)
+        counts = read_pixels(tmp_path / "work" / "masks" / f"{file}.png")
         assert pixels.shape == (side, side, 4) and counts.shape == (side, side, 3)
         assert mask is None or (counts == mask).all()
         assert alpha is None or (pixels[side // 2, side // 2 + 2, 3] == alpha)
@@ -406,7 +409,8 @@ class Reconstruction:
 
     def __init__(self, names):
         self.images = {NAMES.index(name) + 1: SimpleNamespace(name=name) for name in names}
-        self.image, self.reg_image_ids = self.images.__getitem__, self.images.keys
+        self.image = self.images.__getitem__
+        self.reg_image_ids = self.images.keys
 
     def num_reg_images(self):
         return len(self.images)

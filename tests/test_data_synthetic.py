@@ -45,7 +45,8 @@ def test_points_have_the_colours_of_the_pixels_that_see_them(scene):
     """Each point came from some view's pixel, so in the view that fits best it fits nearly exactly."""
     best = np.full(len(scene.points), np.inf)
     for view in (*scene.train, *scene.test):
-        viewmat, K = np.asarray(view.camera.viewmat), np.asarray(view.camera.K)
+        viewmat = np.asarray(view.camera.viewmat)
+        K = np.asarray(view.camera.K)
         homogeneous = (scene.points @ viewmat[:3, :3].T + viewmat[:3, 3]) @ K.T
         column, row = np.floor(homogeneous[:, :2] / homogeneous[:, 2:] + 1e-3).astype(int).T
         is_seen = (column >= 0) & (row >= 0) & (column < view.camera.width) & (row < view.camera.height)
@@ -84,7 +85,8 @@ def test_cells_are_seen_by_all_views_and_two_to_four_pixels_wide():
     assert (len(scene.train), len(scene.test), len(scene.points)) == (28, 4, 2500)
     cell = 1 / 24 * scene.transform.scale
     for view in (*scene.train, *scene.test):
-        image, camera = view_image(view), view.camera
+        image = view_image(view)
+        camera = view.camera
         assert image.shape == (160, 160, 3)
         is_background = (image == 0).all(axis=-1)
         assert 0.3 < is_background.mean() < 0.6 and is_background[:, [0, -1]].all()

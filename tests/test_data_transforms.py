@@ -127,7 +127,8 @@ def check_dots(scene, tolerance=0.03):
     """Every view shows the target where its camera, in the normalised world, says."""
     target = scene.transform.apply(TARGET)
     for view in (*scene.train, *scene.test):
-        viewmat, K = np.asarray(view.camera.viewmat, np.float64), np.asarray(view.camera.K, np.float64)
+        viewmat = np.asarray(view.camera.viewmat, np.float64)
+        K = np.asarray(view.camera.K, np.float64)
         x, y, z = K @ (viewmat[:3, :3] @ target + viewmat[:3, 3])
         weights = (view.image[..., 0] if view.alpha is None else view.alpha).astype(float)
         assert weights.shape == (view.camera.height, view.camera.width)
@@ -136,9 +137,11 @@ def check_dots(scene, tolerance=0.03):
 
 def shares_seen(scene):
     """The share of the scene's points in each training view's picture."""
-    points, shares = np.asarray(scene.points, np.float64), []
+    points = np.asarray(scene.points, np.float64)
+    shares = []
     for view in scene.train:
-        viewmat, K = np.asarray(view.camera.viewmat, np.float64), np.asarray(view.camera.K, np.float64)
+        viewmat = np.asarray(view.camera.viewmat, np.float64)
+        K = np.asarray(view.camera.K, np.float64)
         x, y, z = K @ (viewmat[:3, :3] @ points.T + viewmat[:3, 3:])
         is_within = (z > 0) & (x >= 0) & (x <= z * view.camera.width) & (y >= 0) & (y <= z * view.camera.height)
         shares.append(is_within.mean())

@@ -41,7 +41,8 @@ def ring(rng, target, count=12):
 @pytest.mark.parametrize("seed", range(3))
 def test_moved_camera_sees_the_moved_point_at_the_same_pixel(seed):
     rng = np.random.default_rng(seed)
-    similarity, point = random_similarity(rng), rng.normal(size=3)
+    similarity = random_similarity(rng)
+    point = rng.normal(size=3)
     viewmat = look_at(point + np.array([2, 0.3, 0.1]), point + np.array([0, 0.2, 0]))
     moved = similarity.apply_to_viewmat(viewmat)
     before = viewmat[:3, :3] @ point + viewmat[:3, 3]

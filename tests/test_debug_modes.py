@@ -12,7 +12,8 @@ import pytest
 import a2tg_jax as a2tg
 from a2tg_jax.core.config_json import changed_config
 
-WITHOUT_JIT, CHECKS_FOR_NAN = jax.disable_jit, functools.partial(jax.debug_nans, True)
+WITHOUT_JIT = jax.disable_jit
+CHECKS_FOR_NAN = functools.partial(jax.debug_nans, True)
 
 
 @pytest.mark.long

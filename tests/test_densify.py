@@ -49,11 +49,14 @@ def ones(model: Model):
 
 def twin_plan(event: CloneSplitPrune, model: Model, gradients, iteration: int, num_iterations: int, num_rows: int):
     """Row by row, in Python."""
-    scales, opacities = np.asarray(model.gaussians.scales), np.asarray(model.gaussians.opacities)
+    scales = np.asarray(model.gaussians.scales)
+    opacities = np.asarray(model.gaussians.opacities)
     between = max(num_iterations // 10, 500)
-    kept, wanted = set(), []
+    kept = set()
+    wanted = []
     for row in range(LIVE):
-        size, is_late = scales[row].max(), iteration > between
+        size = scales[row].max()
+        is_late = iteration > between
         if is_late and size > event.largest_share * SCENE_SCALE:
             continue
         if opacities[row] < event.least_opacity and not (is_late and iteration % between < 100):
@@ -63,7 +66,8 @@ def twin_plan(event: CloneSplitPrune, model: Model, gradients, iteration: int, n
             wanted.append(row)
     wanted.sort(key=lambda row: -gradients[row])
     room = min(event.cap, num_rows) - len(kept)
-    doubled, refused = wanted[:room], len(wanted[room:])
+    doubled = wanted[:room]
+    refused = len(wanted[room:])
     split = {row for row in doubled if scales[row].max() > event.dense_share * SCENE_SCALE}
     return kept, set(doubled) - split, split, refused
 
@@ -90,15 +94,18 @@ def test_edit_moves_rows_and_moments_together():
     kept = np.arange(NUM) < LIVE
     kept[rng.choice(LIVE, 6, replace=False)] = False
     rows = rng.permutation(np.flatnonzero(kept))
-    cloned, split = np.isin(np.arange(NUM), rows[:5]), np.isin(np.arange(NUM), rows[5:9])
+    cloned = np.isin(np.arange(NUM), rows[:5])
+    split = np.isin(np.arange(NUM), rows[5:9])
     edit = CloneSplitPlan(*map(jnp.asarray, (kept, cloned, split)))
     after, after_moments = jax.jit(apply_plan)(jax.random.key(3), edit, model, moments)
 
     sources = [*np.flatnonzero(kept), *np.flatnonzero(cloned | split)]
     assert int(after.num_live) == len(sources) == 19 + 9
-    scales, means = np.asarray(model.gaussians.scales), np.asarray(model.gaussians.means)
+    scales = np.asarray(model.gaussians.scales)
+    means = np.asarray(model.gaussians.means)
     for place, row in enumerate(sources):
-        is_half, is_copy = split[row], place >= kept.sum()
+        is_half = split[row]
+        is_copy = place >= kept.sum()
         shrink = 1.6 if is_half else 1.0
         np.testing.assert_allclose(np.asarray(after.gaussians.scales)[place], scales[row] / shrink, rtol=1e-5)
         np.testing.assert_array_equal(after.gaussians.sh[place], model.gaussians.sh[row])
@@ -126,11 +133,13 @@ def test_halves_are_drawn_from_the_gaussian_they_split():
 
 def test_average_is_of_the_views_that_saw_the_gaussian_in_half_images():
     rng = np.random.default_rng(0)
-    gradients, is_visible = rng.normal(size=(3, NUM, 3)).astype(np.float32), rng.random((3, NUM)) < 0.6
+    gradients = rng.normal(size=(3, NUM, 3)).astype(np.float32)
+    is_visible = rng.random((3, NUM)) < 0.6
     gradients[..., 2] = 0
     probe = jnp.asarray(np.concatenate([gradients, np.float32(5) * is_visible[..., None]], axis=-1))
     camera = Camera(jnp.zeros((3, 4, 4)), jnp.zeros((3, 3, 3)), 640, 480)
-    event, model = CloneSplitPrune(NUM), random_model(0)
+    event = CloneSplitPrune(NUM)
+    model = random_model(0)
     state = event.observe(
         event.init(model), model, Seen(camera, *read_probe(probe, "center", 640, 480), jnp.zeros_like(probe[..., :3]))
     )

@@ -103,7 +103,8 @@ def test_parameters_that_nothing_but_adam_changed_are_not_checked_again(scene, m
     run = StageRun(scene, system, 0, initial_model(scene, system))
     settings, stage, _, _, *others = run.arguments(1)
     settings = dataclasses.replace(settings, due=(True,))
-    stage, state = dataclasses.replace(stage, events=(Brighten(),)), dataclasses.replace(run.state, events=(None,))
+    stage = dataclasses.replace(stage, events=(Brighten(),))
+    state = dataclasses.replace(run.state, events=(None,))
     jax.eval_shape(lambda state: step.attempt(settings, stage, stage.clock(1), state, *others), state)
     assert sizes == [1 + 5 * 60 + 60], "the loss, five gradients and the colours"
 
@@ -131,7 +132,8 @@ def test_each_restoration_has_another_order(scene):
 
 
 def test_ctrl_c_in_the_last_step_interrupts_too(scene):
-    system, kept = Gaussians2dMcmc(stage1_iterations=10, **SIZES), []
+    system = Gaussians2dMcmc(stage1_iterations=10, **SIZES)
+    kept = []
     press = lambda row: signal.raise_signal(signal.SIGINT)  # noqa: E731
     with pytest.raises(Interrupted, match="after iteration 10 of stage 1") as stopped, stop_on_signals() as is_stopped:
         fit(scene, system, on_log=press, on_checkpoint=kept.append, is_stopped=is_stopped)
@@ -141,7 +143,8 @@ def test_ctrl_c_in_the_last_step_interrupts_too(scene):
 
 
 def test_a_stop_before_the_first_step_is_a_checkpoint(scene):
-    system, kept = Gaussians2dMcmc(stage1_iterations=10, **SIZES), []
+    system = Gaussians2dMcmc(stage1_iterations=10, **SIZES)
+    kept = []
     with pytest.raises(Interrupted, match="after iteration 0 of stage 1"):
         fit(scene, system, on_checkpoint=kept.append, progress=False, is_stopped=lambda: True)
     assert [checkpoint.iteration for checkpoint in kept] == [0]

@@ -37,7 +37,8 @@ def run(page: str, names: dict, replaced: dict[str, str] | None = None) -> dict:
 def untrained(*args, **kwargs):
     """Stand-in for `fit`: the untrained model with which the last stage of a system begins."""
     given = REAL_FIT.bind(*args, **kwargs).arguments
-    scene, system = given["scene"], given["system"]
+    scene = given["scene"]
+    system = given["system"]
     system.check()
     given.get("on_log", dict)({"iteration": 1, "psnr": 9.0})
     gaussians = a2tg.init_from_points(scene.points, scene.colors, num=50, sh_degree=0)
@@ -69,7 +70,8 @@ def test_textures_are_read_edited_and_put_back():
     """One Gaussian that faces the camera, textured red at the left; mirrored as on the page, it is red at the right."""
     text = (DOCS / "library.md").read_text(encoding="utf-8").partition("## Textures\n")[2]
     block = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)[0]
-    quats, sh = jnp.array([[1.0, 0, 0, 0]]), jnp.full((1, 1, 3), -3.0)  # no colour of its own
+    quats = jnp.array([[1.0, 0, 0, 0]])
+    sh = jnp.full((1, 1, 3), -3.0)  # Black.
     gaussians = a2tg.Gaussians(jnp.zeros((1, 3)), quats, jnp.zeros((1, 2)), jnp.full(1, 2.0), sh)
     texels = np.zeros((2, 2, 4), np.float32)
     texels[..., 3], texels[:, 0, 0] = 1, 1

@@ -43,7 +43,10 @@ class Handler(http.server.SimpleHTTPRequestHandler):
 def server(tmp_path, monkeypatch):
     monkeypatch.setattr(download, "PAUSE_SECONDS", 0.0)
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Handler)) as running:
-        running.folder, running.firsts, running.breaks_after, running.etag = tmp_path / "served", [], None, '"1"'
+        running.folder = tmp_path / "served"
+        running.firsts = []
+        running.breaks_after = None
+        running.etag = '"1"'
         running.folder.mkdir()
         thread = threading.Thread(target=running.serve_forever, args=(0.01,))
         thread.start()
@@ -75,7 +78,8 @@ def fetch(archive, scenes):
 @pytest.mark.parametrize("share", [0.0, 0.4, 1.0], ids=["anew", "continued", "all but renamed"])
 def test_archives_are_fetched_once_from_where_they_stopped(server, tmp_path, share):
     members = {"garden/images/a.jpg": "a" * 5_000, "garden/b.txt": "b", "__MACOSX/garden/._b.txt": "x"}
-    archive, scenes = archive_of(server, members), tmp_path / "scenes"
+    archive = archive_of(server, members)
+    scenes = tmp_path / "scenes"
     content = (server.folder / "set.zip").read_bytes()
     have = round(share * len(content))
     if have:
@@ -102,7 +106,8 @@ def test_parts_of_two_versions_are_not_joined(server, tmp_path, monkeypatch):
     with pytest.raises(OSError, match="call again"):
         fetch(archive, tmp_path / "scenes")
     archive = archive_of(server, {"a.txt": "b" * 5_000})
-    server.etag, server.breaks_after = '"2"', None
+    server.etag = '"2"'
+    server.breaks_after = None
     fetch(archive, tmp_path / "scenes")
     assert server.firsts == [0, 0] and (tmp_path / "scenes/360_v2/a.txt").read_text() == "b" * 5_000
 
@@ -117,7 +122,8 @@ def test_a_wrong_checksum_is_an_error(server, tmp_path):
 
 
 def test_what_is_damaged_is_deleted_and_said(server, tmp_path):
-    archive, scenes = archive_of(server, {"garden/a.txt": "a"}), tmp_path / "scenes"
+    archive = archive_of(server, {"garden/a.txt": "a"})
+    scenes = tmp_path / "scenes"
     (scenes / "archives").mkdir(parents=True)
     (scenes / "archives" / "set.zip.partial").write_bytes(bytes(10_000))
     with pytest.raises(OSError, match="more bytes"):
@@ -142,7 +148,8 @@ def test_links_in_archives_are_refused(server, tmp_path, kind):
     archive = archive_of(server, {}, "set.tar.gz")
     with tarfile.open(server.folder / "set.tar.gz", "w:gz") as packed:
         link = tarfile.TarInfo("garden")
-        link.type, link.linkname = kind, "../.."
+        link.type = kind
+        link.linkname = "../.."
         packed.addfile(link)
         packed.addfile(tarfile.TarInfo("garden/outside.txt"))
     for _ in range(2):
@@ -152,7 +159,8 @@ def test_links_in_archives_are_refused(server, tmp_path, kind):
 
 
 def test_what_came_from_elsewhere_is_not_overwritten(server, tmp_path):
-    archive, own = archive_of(server, {"garden/": "", "garden/a.txt": "new"}), tmp_path / "scenes/360_v2/garden/a.txt"
+    archive = archive_of(server, {"garden/": "", "garden/a.txt": "new"})
+    own = tmp_path / "scenes/360_v2/garden/a.txt"
     own.parent.mkdir(parents=True)
     own.write_text("my own")
     for _ in range(2):

@@ -55,7 +55,8 @@ def test_limits_of_floaters_are_whole_numbers():
 
 def test_floaters_are_what_floats_not_what_is_faint():
     """A wall that is sparse, large and faint stays; small opaque needles before it go."""
-    model, rng = captured(NOWHERE), np.random.default_rng(0)
+    model = captured(NOWHERE)
+    rng = np.random.default_rng(0)
     floor = np.concatenate([rng.uniform(-1, 1, (400, 2)), rng.normal(0, 0.01, (400, 1))], axis=1)
     wall = np.concatenate([rng.uniform(-6, 6, (60, 2)), rng.normal(-3, 0.1, (60, 1))], axis=1)
     centers = centers_of(model.origin.viewmats)
@@ -88,7 +89,8 @@ def test_scores_of_few_or_equal_gaussians():
 def test_the_viewers_file_has_the_same_scores_and_the_vertical():
     model = a2tg.apply_edit(small_model(), a2tg.Edit(up=np.array([0.0, 0.6, 0.8])))
     header, body = taken_apart(data := encode_web_scene(model))
-    scores, start = [], 0
+    scores = []
+    start = 0
     for name, coder, length in header["parts"]:
         if name == "floaters":
             count = min(header["chunk"], 300 - sum(map(len, scores)))
@@ -100,7 +102,8 @@ def test_the_viewers_file_has_the_same_scores_and_the_vertical():
 
 
 def test_a_chosen_vertical_turns_files_and_orbits_but_no_number(tmp_path):
-    model, up = captured(NOWHERE), TILTED @ [0, 0, 1]
+    model = captured(NOWHERE)
+    up = TILTED @ [0, 0, 1]
     edited = a2tg.apply_edit(model, a2tg.Edit(up=up))
     np.testing.assert_array_equal(edited.gaussians.sh, model.gaussians.sh)
     for suffix in (".npz", ".a2tgz", ".glb"):

@@ -105,7 +105,8 @@ def test_run_folders_keep_it_and_mean_3_without_it(tmp_path):
 
 
 def test_models_of_two_extents_are_not_joined():
-    narrow, wide = some_model(SYSTEM), some_model(a2tg.A2tg(sh_degree=0))
+    narrow = some_model(SYSTEM)
+    wide = some_model(a2tg.A2tg(sh_degree=0))
     assert a2tg.concatenate([narrow, narrow]).appearance.texture_options == NARROW
     with pytest.raises(
         ValueError, match=r"one extent; got 1\.5 and 3: train them with the same lookup\.extent, or bake"

@@ -33,10 +33,13 @@ def weighted(scene, features, background):
 def test_features_are_weighted_as_colours_are(channels, compositor):
     """On a scene with textures, whose alpha counts; the gradients in features and background are the weights."""
     scene = SMOOTH
-    features, background = some_features(6, channels), np.linspace(-1, 1, channels)
+    features = some_features(6, channels)
+    background = np.linspace(-1, 1, channels)
     cotangent = np.random.default_rng(1).normal(size=(8, 8, channels))
-    gaussians, camera = as_gaussians(scene, "float64"), as_camera(scene, "float64")
-    textures, settings = as_textures(scene, "float64"), RenderSettings(capacity=1024, compositor=compositor)
+    gaussians = as_gaussians(scene, "float64")
+    camera = as_camera(scene, "float64")
+    textures = as_textures(scene, "float64")
+    settings = RenderSettings(capacity=1024, compositor=compositor)
 
     def loss(features, background):
         shown = {"features": features, "background": background, "settings": settings}
@@ -58,7 +61,8 @@ def test_features_are_weighted_as_colours_are(channels, compositor):
 @pytest.mark.parametrize("channels", quick_then_long([8], [64]))
 def test_gradients_in_geometry_are_those_of_differences(channels):
     """Along one direction of all the Gaussians' numbers."""
-    features, camera = jnp.asarray(some_features(6, channels)), as_camera(SMOOTH, "float64")
+    features = jnp.asarray(some_features(6, channels))
+    camera = as_camera(SMOOTH, "float64")
     settings = RenderSettings(capacity=1024, compositor="native")
 
     @jax.jit
@@ -66,7 +70,8 @@ def test_gradients_in_geometry_are_those_of_differences(channels):
     def differentiate(gaussians):
         return jnp.sum(render_image(gaussians, camera, features=features, settings=settings).color ** 2)
 
-    gaussians, step = as_gaussians(SMOOTH, "float64"), 3e-6
+    gaussians = as_gaussians(SMOOTH, "float64")
+    step = 3e-6
     rng = np.random.default_rng(0)
     direction = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), gaussians)
     ahead, behind = (
@@ -82,7 +87,8 @@ def test_gradients_in_geometry_are_those_of_differences(channels):
 @pytest.mark.usefixtures("gpu_kernels")
 def test_gpu_kernels_show_features():
     scene = draw_scene(4, num=4, width=8, height=8)
-    gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
+    gaussians = as_gaussians(scene, "float32")
+    camera = as_camera(scene, "float32")
     features = jnp.asarray(some_features(4, 5), jnp.float32)
 
     def loss(features, gaussians, compositor):
@@ -97,7 +103,8 @@ def test_gpu_kernels_show_features():
 
 def test_features_of_a_model():
     """Of the rows that exist; the model's background is a colour, so the background of features is 0."""
-    gaussians, camera = as_gaussians(SCENE, "float32"), as_camera(SCENE, "float32")
+    gaussians = as_gaussians(SCENE, "float32")
+    camera = as_camera(SCENE, "float32")
     features = jnp.asarray(some_features(8, 4), jnp.float32)
     model = Model(gaussians, num_live=jnp.int32(5))
     expected = render_image(gaussians[:5], camera, features=features[:5]).color
@@ -120,7 +127,8 @@ class Two(Appearance):
 
 
 def test_an_appearance_may_have_other_colours_than_three():
-    gaussians, camera = as_gaussians(SCENE, "float32"), as_camera(SCENE, "float32")
+    gaussians = as_gaussians(SCENE, "float32")
+    camera = as_camera(SCENE, "float32")
     color = render_appearance(gaussians, camera, Two()).color
     assert color.shape == (9, 11, 2) and jnp.abs(color).max() > 0.1
     np.testing.assert_allclose(color[..., 0], -color[..., 1], atol=1e-6)
@@ -133,7 +141,8 @@ def test_an_appearance_may_have_other_colours_than_three():
 
 
 def test_mistakes_are_named():
-    gaussians, camera = as_gaussians(SCENE, "float32"), as_camera(SCENE, "float32")
+    gaussians = as_gaussians(SCENE, "float32")
+    camera = as_camera(SCENE, "float32")
     features = jnp.asarray(some_features(8, 5), jnp.float32)
     for given, words in (
         ({"features": features[:7]}, r"features must be \[8, D\]; got \[7, 5\]"),

@@ -120,7 +120,8 @@ def test_gaussforge_reads_our_files_as_we_do(tmp_path, suffix):
 
 
 def test_positions_beyond_a_format_are_refused_or_told(tmp_path):
-    path, near = tmp_path / "a.spz", small_scene()
+    path = tmp_path / "a.spz"
+    near = small_scene()
     means = near.gaussians.means.at[0].add(4100).at[1].add(-2050)  # No other origin has all within reach.
     far = dataclasses.replace(near, gaussians=dataclasses.replace(near.gaussians, means=means))
     with pytest.raises(ValueError, match=r"holds positions up to 2048 units.*write \*\.ply or"):
@@ -251,7 +252,8 @@ def test_bytes_of_an_embedded_buffer_are_those_of_its_file(tmp_path):
 
 @pytest.mark.long
 def test_training_starts_from_a_file_in_place_of_the_first_stage(tmp_path, capsys, monkeypatch):
-    scene, started = synthetic_scene(width=32, height=24, num_views=4, num_points=50), []
+    scene = synthetic_scene(width=32, height=24, num_views=4, num_points=50)
+    started = []
 
     def begun(scene, system, index, start, **options):
         started.append((index, start))
@@ -281,7 +283,9 @@ def test_training_starts_from_a_file_in_place_of_the_first_stage(tmp_path, capsy
 
 @pytest.mark.long
 def test_a_file_in_place_of_the_first_stage_is_read_once_and_counted(tmp_path, monkeypatch):
-    scene, read, counts = synthetic_scene(width=32, height=24, num_views=4, num_points=50), [], []
+    scene = synthetic_scene(width=32, height=24, num_views=4, num_points=50)
+    read = []
+    counts = []
 
     def read_and_noted(file):
         read.append(file)

@@ -73,7 +73,8 @@ def assert_shows_the_same(found, model):
 
 @every_model
 def test_models_come_back(tmp_path, name):
-    model, path = MODELS[name](), tmp_path / ("a b.gltf" if name == "textured" else "m.glb")
+    model = MODELS[name]()
+    path = tmp_path / ("a b.gltf" if name == "textured" else "m.glb")
     save_gltf(path, model)
     found = load_gltf(path)
     assert_shows_the_same(found, model)
@@ -82,7 +83,8 @@ def test_models_come_back(tmp_path, name):
     assert found.num_bytes == model.num_bytes
     for x, y in zip(jax.tree.leaves(found.textures), jax.tree.leaves(model.textures), strict=True):
         np.testing.assert_array_equal(x, y)
-    shapes, wanted = found.appearance.shapes, model.appearance.shapes
+    shapes = found.appearance.shapes
+    wanted = model.appearance.shapes
     assert (shapes is None) == (wanted is None)
     if shapes is not None:
         np.testing.assert_allclose(np.tanh(shapes), np.tanh(wanted), atol=1e-6)
@@ -104,7 +106,8 @@ def test_textures_in_bytes_come_back_within_half_a_step(tmp_path, options):
     save_gltf(tmp_path / "m.glb", model, texels="uint8")
     found = load_gltf(tmp_path / "m.glb")
     assert_same_rule(found, model)
-    values, wanted = found.textures.flat(), model.textures.flat()
+    values = found.textures.flat()
+    wanted = model.textures.flat()
     for columns in (slice(0, 3), slice(3, 4)):
         step = np.ptp(wanted[:, columns]) / 254
         assert 0 < np.abs(values - wanted)[:, columns].max() <= step / 2 * 1.001
@@ -116,7 +119,8 @@ def test_textures_in_bytes_come_back_within_half_a_step(tmp_path, options):
 
 def test_programs_that_know_no_textures_see_plain_splats(tmp_path):
     """Without the extension the file holds what `save_ply` holds."""
-    path, model = tmp_path / "m.glb", textured()
+    path = tmp_path / "m.glb"
+    model = textured()
     save_gltf(path, model)
     described, binary = parts_of(path)
     assert EXTENSION in described["extensionsUsed"] and "extensionsRequired" not in described
@@ -160,7 +164,8 @@ def test_long_names_of_other_scripts_come_back(tmp_path):
 
 def test_attributes_are_those_of_the_specification(tmp_path):
     """Activated numbers, quaternions xyzw, covariance M·C·Cᵀ·Mᵀ, coefficients by degree and order."""
-    model, path = plain(16), tmp_path / "m.glb"
+    model = plain(16)
+    path = tmp_path / "m.glb"
     save_gltf(path, model)
     described, binary = parts_of(path)
     primitive = described["meshes"][0]["primitives"][0]
@@ -169,8 +174,10 @@ def test_attributes_are_those_of_the_specification(tmp_path):
         "kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective",
         "sortingMethod": "cameraDistance",
     }  # fmt: skip
-    means, opacities = attribute(described, binary, "POSITION"), attribute(described, binary, f"{SPLATS}:OPACITY")
-    scales, quats = attribute(described, binary, f"{SPLATS}:SCALE"), attribute(described, binary, f"{SPLATS}:ROTATION")
+    means = attribute(described, binary, "POSITION")
+    opacities = attribute(described, binary, f"{SPLATS}:OPACITY")
+    scales = attribute(described, binary, f"{SPLATS}:SCALE")
+    quats = attribute(described, binary, f"{SPLATS}:ROTATION")
     accessor = described["accessors"][primitive["attributes"]["POSITION"]]
     np.testing.assert_array_equal([accessor["min"], accessor["max"]], [means.min(axis=0), means.max(axis=0)])
     np.testing.assert_allclose(np.linalg.norm(quats, axis=1), 1, atol=1e-6)
@@ -178,7 +185,8 @@ def test_attributes_are_those_of_the_specification(tmp_path):
     np.testing.assert_allclose(scales[:, :2], model.gaussians.scales, rtol=1e-5)
     np.testing.assert_allclose(scales[:, 2], scales[:, :2].min(axis=1) / 1000, rtol=1e-5)
     np.testing.assert_allclose(rotations(quats[:, [3, 0, 1, 2]]), rotations(model.gaussians.quats), atol=1e-5)
-    sh, index = np.asarray(model.sh), 0
+    sh = np.asarray(model.sh)
+    index = 0
     for degree in range(4):
         for order in range(2 * degree + 1):
             values = attribute(described, binary, f"{SPLATS}:SH_DEGREE_{degree}_COEF_{order}")
@@ -214,7 +222,9 @@ def test_the_node_stands_upright_in_the_lengths_of_the_original_world(tmp_path):
 
 
 def test_a_moved_node_moves_the_model_and_its_cameras(tmp_path):
-    model, path, move = textured(), tmp_path / "m.glb", some_world(3)
+    model = textured()
+    path = tmp_path / "m.glb"
+    move = some_world(3)
     save_gltf(path, model)
     described, binary = parts_of(path)
     own = np.reshape(described["nodes"][0]["matrix"], (4, 4)).T
@@ -231,8 +241,10 @@ def test_a_moved_node_moves_the_model_and_its_cameras(tmp_path):
 def test_integers_that_stand_for_fractions(tmp_path):
     """Quantised attributes, interleaved in one view, in a node of translation, rotation and scale, and an embedded
     buffer."""
-    path, gaussians = tmp_path / "m.gltf", some_gaussians(5)
-    quats, scales = unit(gaussians.quats)[:, [1, 2, 3, 0]], np.exp(np.asarray(gaussians.log_scales))
+    path = tmp_path / "m.gltf"
+    gaussians = some_gaussians(5)
+    quats = unit(gaussians.quats)[:, [1, 2, 3, 0]]
+    scales = np.exp(np.asarray(gaussians.log_scales))
     dtype = np.dtype([("p", "<f4", 3), ("q", "<i2", 4), ("s", "<u2", 4), ("o", "u1", 4), ("c", "<f4", 3)])
     rows = np.zeros(5, dtype)
     rows["p"], rows["c"] = gaussians.means, gaussians.sh[:, 0]
@@ -274,7 +286,8 @@ def test_integers_that_stand_for_fractions(tmp_path):
 
 
 def test_several_meshes_make_one_model(tmp_path):
-    path, model = tmp_path / "m.glb", textured()
+    path = tmp_path / "m.glb"
+    model = textured()
 
     def repeat(described):
         node = described["nodes"][0]
@@ -318,14 +331,16 @@ def test_shapes_are_what_the_extension_says(tmp_path, saved):
 
 
 def test_other_kernels_and_colours_are_reported(tmp_path):
-    path, linear = tmp_path / "m.glb", {"colorSpace": "lin_rec709_display"}
+    path = tmp_path / "m.glb"
+    linear = {"colorSpace": "lin_rec709_display"}
     rewritten(path, plain(), lambda described: first_primitive(described)["extensions"][SPLATS].update(linear))
     with pytest.warns(UserWarning, match="colorSpace lin_rec709_display; they are read as srgb_rec709_display"):
         load_gltf(path)
 
 
 def test_degree_4_is_read_to_degree_3(tmp_path):
-    path, model = tmp_path / "m.glb", plain(16)
+    path = tmp_path / "m.glb"
+    model = plain(16)
 
     def add_degree(described):
         attributes = first_primitive(described)["attributes"]
@@ -459,9 +474,11 @@ def test_a_buffer_that_is_missing_or_too_short(tmp_path):
 
 def test_no_more_numbers_than_the_file_can_hold(tmp_path, saved, monkeypatch):
     """However often it refers to the same bytes."""
-    path, described = tmp_path / "m.glb", json.loads(json.dumps(saved[0]))
+    path = tmp_path / "m.glb"
+    described = json.loads(json.dumps(saved[0]))
     write_parts(path, *saved)
-    document, num_read = Document(path), 0
+    document = Document(path)
+    num_read = 0
     with pytest.raises(ValueError, match="means would take 600 bytes, which the file is too small for"):
         while num_read < 100 * path.stat().st_size:
             num_read += document.numbers(0, "VEC3", "means").nbytes
@@ -473,7 +490,8 @@ def test_no_more_numbers_than_the_file_can_hold(tmp_path, saved, monkeypatch):
 
 
 def test_numbers_that_are_not_finite(tmp_path, saved):
-    described, binary = json.loads(json.dumps(saved[0])), bytearray(saved[1])
+    described = json.loads(json.dumps(saved[0]))
+    binary = bytearray(saved[1])
     binary[:4] = np.float32(np.nan).tobytes()
     write_parts(tmp_path / "m.glb", described, bytes(binary))
     refused(tmp_path / "m.glb", "means must be finite")

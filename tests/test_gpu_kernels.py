@@ -89,7 +89,8 @@ def test_nvrtc_tells_what_it_refuses(has_nvrtc):
 def test_xla_takes_them():
     """A program for CUDA, lowered on a machine without it, launches one kernel each way, a thread a pixel."""
     scene = draw_scene(4, num=8, width=40, height=24)
-    gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
+    gaussians = as_gaussians(scene, "float32")
+    camera = as_camera(scene, "float32")
 
     def loss(gaussians):
         settings = RenderSettings(compositor="cuda", tile_size=16, capacity=512)
@@ -108,7 +109,8 @@ def test_xla_takes_them():
 def test_long_lists_and_odd_tiles(num, tile_size, size):
     """More splats than a batch, tiles of several blocks, and tiles that no warp fills, with every texture size."""
     scene = draw_scene(7, num=num, width=size[0], height=size[1])
-    gaussians, camera = as_gaussians(scene, "float64"), as_camera(scene, "float64")
+    gaussians = as_gaussians(scene, "float64")
+    camera = as_camera(scene, "float64")
     textures = as_textures(scene, "float64")
 
     def loss(gaussians, buckets, compositor):
@@ -132,12 +134,14 @@ def test_long_lists_and_odd_tiles(num, tile_size, size):
 def test_gpu_kernels_are_those_of_xla(has_textures, statistic):
     """Interpreted, on a small scene: the image, the gradient, and a statistic."""
     scene = draw_scene(4, num=16, width=19, height=13)
-    gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
+    gaussians = as_gaussians(scene, "float32")
+    camera = as_camera(scene, "float32")
     appearance = Appearance(texture=Texture(as_textures(scene, "float32"))) if has_textures else Appearance()
     floats, rest = partition(appearance)
 
     def loss(gaussians, floats, probe, compositor):
-        settings, shown = RenderSettings(compositor=compositor, capacity=1024), combine(floats, rest)
+        settings = RenderSettings(compositor=compositor, capacity=1024)
+        shown = combine(floats, rest)
         output, _ = render_traced(gaussians, camera, shown, jnp.ones(3), settings, probe=probe, statistic=statistic)
         return jnp.sum(output.color**2) + jnp.sum(output.depth) + jnp.sum(output.normal * output.color), output
 

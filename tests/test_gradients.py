@@ -22,7 +22,8 @@ def test_gradients_are_those_of_the_image_and_the_statistic_is_the_oracles():
     scene = draw_scene(4)
     cotangent = np.random.default_rng(4).normal(size=(scene.height, scene.width, 3))
     model = Model(as_gaussians(scene, "float64"), Appearance(texture=Texture(as_textures(scene, "float64"))))
-    camera, settings = as_camera(scene, "float64"), RenderSettings(capacity=CAPACITY)
+    camera = as_camera(scene, "float64")
+    settings = RenderSettings(capacity=CAPACITY)
 
     def loss(model, output):
         return jnp.sum(output.color * jnp.asarray(cotangent)) + jnp.sum(model.gaussians.opacities)
@@ -67,7 +68,8 @@ def test_a_gradient_of_textures_has_none_for_their_places():
 def test_norms_are_those_that_events_average(event):
     """Also where the statistic is by the position on the screen, whose thresholds are in units of half an image."""
     scene = draw_scene(4)
-    model, camera = Model(as_gaussians(scene, "float32")), as_camera(scene, "float32")
+    model = Model(as_gaussians(scene, "float32"))
+    camera = as_camera(scene, "float32")
     settings = RenderSettings(capacity=CAPACITY)
     loss = lambda model, output: jnp.sum(output.color**2)  # noqa: E731
     found = view_gradients(loss, model, camera, settings=settings, statistic=event.statistic)
@@ -108,7 +110,8 @@ def test_a_loop_by_hand_learns_and_upscales():
         return model, update.state, statistics.observe(found.norms, found.is_visible), found.value
 
     def train(model, moments):
-        statistics, losses = a2tg.GradientStatistics.init(model.num), []
+        statistics = a2tg.GradientStatistics.init(model.num)
+        losses = []
         for _ in range(15):
             for camera, target in zip(cameras, truth, strict=True):
                 model, moments, statistics, loss = step(model, moments, statistics, camera, target)
@@ -124,7 +127,8 @@ def test_a_loop_by_hand_learns_and_upscales():
     sizes = np.where(chosen[:, None], proposed, sizes)
     grown = a2tg.reallocate(model.textures, sizes, moments)
     assert grown.moments.mu.gaussians.means is moments.mu.gaussians.means and grown.moments.count is moments.count
-    moments, model = grown.moments, model.with_textures(grown.textures)
+    moments = grown.moments
+    model = model.with_textures(grown.textures)
     assert model.num_bytes == 232 * 50 + 16 * sizes.prod(axis=1).sum() and chosen.sum() == 13
 
     model, moments, statistics, after = train(model, moments)

@@ -39,7 +39,8 @@ def scene():
 def first_model(file, scene, system, tmp_path) -> a2tg.Model:
     """The model that the splats of a file give instead of the first stage."""
     record = RunRecord(SceneSource("synthetic"), system.name, system, init=str(file))
-    run, planned = create_run(tmp_path / "run"), record.plan.stages[0]
+    run = create_run(tmp_path / "run")
+    planned = record.plan.stages[0]
     write_first_stage(run, record, a2tg.load_splats(file), scene)
     found = a2tg.load_model(run.model(planned.name))
     assert rule_of(found.appearance) == planned.stage.appearance

@@ -25,7 +25,8 @@ from a2tg_jax.rasterize.views import render_traced
 
 NUM = 50
 SCENE = draw_scene(1, num=NUM)
-GAUSSIANS, CAMERA = as_gaussians(SCENE, "float32"), as_camera(SCENE, "float32")
+GAUSSIANS = as_gaussians(SCENE, "float32")
+CAMERA = as_camera(SCENE, "float32")
 LIMITS = np.iinfo(np.int32)
 STRAY = [LIMITS.min, -100_000, -1, NUM, 100_000, 100_000_000, LIMITS.max]
 WITH_CUDA = quick_then_long(["native"], ["cuda"])
@@ -57,7 +58,9 @@ def rendered(compositor):
 
 @pytest.mark.parametrize("compositor", WITH_CUDA)
 def test_traced_places_where_no_texture_is_show_the_nearest_one(compositor):
-    render, by_xla, rng = rendered(compositor), rendered("xla"), np.random.default_rng(0)
+    render = rendered(compositor)
+    by_xla = rendered("xla")
+    rng = np.random.default_rng(0)
     for stray in STRAY:
         for field in ("row", "bucket"):
             index = np.where(rng.uniform(size=NUM) < 0.7, stray, getattr(TEXTURES, field)).astype(np.int32)
@@ -75,7 +78,9 @@ def test_traced_places_where_no_texture_is_show_the_nearest_one(compositor):
 @pytest.mark.long
 @pytest.mark.parametrize("dtype", [np.int8, np.uint32])
 def test_places_of_any_integers(dtype):
-    render, most, is_stray = rendered("native"), np.iinfo(dtype).max, np.arange(NUM) % 2 == 0
+    render = rendered("native")
+    most = np.iinfo(dtype).max
+    is_stray = np.arange(NUM) % 2 == 0
     row = np.where(is_stray, most, np.asarray(TEXTURES.row)).astype(dtype)
     as_int32 = np.where(is_stray, min(most, LIMITS.max), np.asarray(TEXTURES.row)).astype(np.int32)
     value, other = (render(dataclasses.replace(TEXTURES, row=jnp.asarray(own)))[0] for own in (row, as_int32))
@@ -91,7 +96,8 @@ def test_places_of_other_textures(compositor):
     plain = rendered(compositor)(a2tg.allocate_textures([(2, 2)] * NUM))[0]
     for num in (4, 5000):
         textures = a2tg.allocate_textures([(2, 2)] * num)
-        bucket, row = jnp.zeros(NUM, jnp.int32), jnp.arange(NUM, dtype=jnp.int32)
+        bucket = jnp.zeros(NUM, jnp.int32)
+        row = jnp.arange(NUM, dtype=jnp.int32)
         value, gradient = rendered(compositor)(dataclasses.replace(textures, bucket=bucket, row=row))
         np.testing.assert_array_equal(value, plain)
         assert np.isfinite(gradient.buckets[0]).all() and np.abs(gradient.buckets[0]).max() > 0
@@ -135,7 +141,8 @@ def test_pictures_with_rows_out_of_range():
 @functools.cache
 def view_of(compositor):
     """What a compositor takes for the scene: settings, splats, texels, regions, cutoff, and good lists."""
-    appearance, grid = a2tg.Appearance(texture=Texture(TEXTURES)), TileGrid(CAMERA.width, CAMERA.height, 16)
+    appearance = a2tg.Appearance(texture=Texture(TEXTURES))
+    grid = TileGrid(CAMERA.width, CAMERA.height, 16)
     splats, cutoff = project_gaussians(GAUSSIANS, CAMERA, appearance, 0.2, 3)
     options = {"has_geometry": False, "statistic": "position", "compositor": compositor, "tile_batch": 1}
     settings, *places = settings_of_pass(appearance, splats, grid, 0.2, **options)
@@ -165,7 +172,8 @@ def stray_numbers(rng, numbers):
 def test_regions_and_lists_of_any_integers(compositor):
     """Good ones lead to what XLA finds, and nearly so do stray regions."""
     _, _, _, regions, _, lists = view_of("native")
-    run, by_xla = differentiated(compositor), differentiated("xla")
+    run = differentiated(compositor)
+    by_xla = differentiated("xla")
     assert_all_close(run(regions, lists), by_xla(regions, lists), 1e-3, 1e-3)
     for seed in range(8):
         rng = np.random.default_rng(seed)
@@ -175,7 +183,8 @@ def test_regions_and_lists_of_any_integers(compositor):
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
         if seed >= 4 or compositor == "cuda":
             continue
-        found, wanted = run(stray, lists), by_xla(stray, lists)
+        found = run(stray, lists)
+        wanted = by_xla(stray, lists)
         np.testing.assert_allclose(found[0], wanted[0], rtol=1e-3)
         for own, other in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
             # Textures of a thousand texels along an axis have slopes that turn rounding into another pixel at 1/255.
@@ -226,7 +235,8 @@ def with_number(gaussians, field: str, row: int, number: float):
 @pytest.mark.parametrize("compositor", WITH_XLA)
 def test_a_splat_that_is_not_a_number_does_not_vanish_unless_it_shows_nowhere(compositor):
     """Behind the camera, too faint, or beyond the live rows, it may hold anything."""
-    gaussians, camera = as_gaussians(SMALL, "float32"), as_camera(SMALL, "float32")
+    gaussians = as_gaussians(SMALL, "float32")
+    camera = as_camera(SMALL, "float32")
     settings = a2tg.RenderSettings(compositor=compositor, capacity=1024)
 
     @jax.jit
@@ -251,8 +261,10 @@ def test_a_splat_that_is_not_a_number_does_not_vanish_unless_it_shows_nowhere(co
 
 @pytest.mark.parametrize("compositor", ALL)
 def test_a_texel_that_is_not_a_number_is_seen(compositor):
-    gaussians, camera = as_gaussians(SMALL, "float32"), as_camera(SMALL, "float32")
-    textures, settings = as_textures(SMALL, "float32"), a2tg.RenderSettings(compositor=compositor, capacity=1024)
+    gaussians = as_gaussians(SMALL, "float32")
+    camera = as_camera(SMALL, "float32")
+    textures = as_textures(SMALL, "float32")
+    settings = a2tg.RenderSettings(compositor=compositor, capacity=1024)
     draw = jax.jit(lambda textures: a2tg.render_image(gaussians, camera, textures, settings=settings))
     shown = draw(textures).alpha > 0.05
     assert shown.any()

@@ -76,9 +76,11 @@ GAUSSIANS = ("means", "quats", "log_scales", "logit_opacities", "sh")
 
 @pytest.mark.parametrize("name", [*GAUSSIANS, "appearance/texels"])
 def test_models_with_numbers_that_are_not_finite_or_too_large(tmp_path, name):
-    path, field = tmp_path / "m.npz", name.removeprefix("appearance/")
+    path = tmp_path / "m.npz"
+    field = name.removeprefix("appearance/")
     save_model(path, some_model())
-    whole, limit = path.read_bytes(), rf"{field}.* within ±1e\+12; got"
+    whole = path.read_bytes()
+    limit = rf"{field}.* within ±1e\+12; got"
     for value in (np.nan, np.inf, -np.inf, 1e38, -2e12):
         path.write_bytes(whole)
         spoiled(path, with_number(name, value))
@@ -264,7 +266,8 @@ def test_models_that_are_no_files(tmp_path, kind):
 
 # Checkpoints
 
-MU, EVENTS = "[1][0][0].mu.gaussians.means", "[1][0][2]"
+MU = "[1][0][0].mu.gaussians.means"
+EVENTS = "[1][0][2]"
 
 
 @pytest.fixture(scope="module", params=["a2tg", pytest.param("bytewise", marks=pytest.mark.long)])
@@ -454,7 +457,8 @@ def test_json_of_pythons_own_library_is_read():
 def test_ply_with_numbers_that_are_not_finite(tmp_path, value):
     path = tmp_path / "g.ply"
     save_ply(path, some_gaussians())
-    whole, number = path.read_bytes(), np.float32(value).tobytes()
+    whole = path.read_bytes()
+    number = np.float32(value).tobytes()
     path.write_bytes(whole[:-4] + number)
     with pytest.warns(UserWarning, match=f"1 Gaussian of {NUM} left out"):
         assert load_ply(path).num == NUM - 1

@@ -104,7 +104,8 @@ def test_heic_is_read_with_its_library(tmp_path):
     library.from_pillow(Image.fromarray(colors)).save(tmp_path / "photo.heic", quality=90)
     assert np.abs(read_pixels(tmp_path / "photo.heic").astype(int) - colors).max() < 10
     assert picture_facts(tmp_path / "photo.heic").size == (16, 12)
-    whole, rng = (tmp_path / "photo.heic").read_bytes(), np.random.default_rng(1)
+    whole = (tmp_path / "photo.heic").read_bytes()
+    rng = np.random.default_rng(1)
     for data in (*(whole[:size] for size in range(0, len(whole), 40)), *(flipped(whole, rng) for _ in range(60))):
         (tmp_path / "broken").write_bytes(data)
         try:
@@ -125,7 +126,9 @@ def test_heic_without_its_library_is_one_line_with_the_command(tmp_path, monkeyp
 @pytest.mark.parametrize("kind", ["PNG", "TIFF", "BMP", "PPM", "GIF", "WEBP", "JPEG", "AVIF"])
 def test_broken_pictures_are_one_clear_line(tmp_path, kind):
     """Pixels, or an error that names the file."""
-    whole, rng, file = encoded(kind), np.random.default_rng(1), tmp_path / "broken"
+    whole = encoded(kind)
+    rng = np.random.default_rng(1)
+    file = tmp_path / "broken"
     cuts = [whole[:size] for size in rng.integers(0, len(whole), 10)]
     for data in itertools.chain(cuts, (flipped(whole, rng) for _ in range(60))):
         file.write_bytes(data)

@@ -46,7 +46,8 @@ def of_headers(tmp_path_factory) -> dict[str, int]:
             numbers = f"offsetof(struct {struct}, {field}), sizeof(((struct {struct}*)0)->{field})"
             lines.append(f'printf("{struct}.{field} %zu\\n{struct}.{field}:size %zu\\n", {numbers});')
     folder = tmp_path_factory.mktemp("headers")
-    source, program = folder / "sizes.c", folder / "sizes"
+    source = folder / "sizes.c"
+    program = folder / "sizes"
     text = ["#include <stdio.h>", '#include "xla/ffi/api/c_api.h"', "int main(void) {", *lines, "return 0; }"]
     source.write_text("\n".join(text))
     subprocess.run([compiler, "-I", jax.ffi.include_dir(), "-o", program, source], check=True)

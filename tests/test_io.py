@@ -66,7 +66,8 @@ def test_ply_attributes_in_the_order_of_2dgs(tmp_path):
 
 
 def test_ply_goes_back_to_the_original_world(tmp_path):
-    original, world = some_gaussians(), some_world()
+    original = some_gaussians()
+    world = some_world()
     save_ply(tmp_path / "g.ply", transform_gaussians(original, world), transform=world)
     unit = original.quats / jnp.linalg.norm(original.quats, axis=-1, keepdims=True)
     loaded = load_ply(tmp_path / "g.ply")
@@ -162,7 +163,8 @@ def filtered(log_scales, logit, width):
 @pytest.mark.parametrize("encoding", ["ascii", "binary_big_endian"])
 @pytest.mark.parametrize("is_flat", [False, True])
 def test_the_filter_of_mip_splatting_is_applied(tmp_path, encoding, is_flat):
-    names, rng = [*ATTRIBUTES, "scale_2", "filter_3D"], np.random.default_rng(0)
+    names = [*ATTRIBUTES, "scale_2", "filter_3D"]
+    rng = np.random.default_rng(0)
     rows = rng.normal(size=(6, len(names)))
     rows[:, names.index("scale_2")] = -9
     rows[:, names.index("filter_3D")] = [0.3, 0.05, 0.0, 2.0, np.nan, -0.3]
@@ -244,7 +246,8 @@ def test_elements_before_the_vertices_are_skipped(tmp_path):
 
 def test_a_third_scale_of_0_is_flat(tmp_path):
     """Its logarithm is −inf; in other places that is no number."""
-    names, rows = (*ATTRIBUTES, "scale_2"), np.random.default_rng(0).normal(size=(3, len(ATTRIBUTES) + 1))
+    names = (*ATTRIBUTES, "scale_2")
+    rows = np.random.default_rng(0).normal(size=(3, len(ATTRIBUTES) + 1))
     rows[:, -1] = -np.inf
     write_ply(tmp_path / "g.ply", names, rows)
     np.testing.assert_allclose(load_ply(tmp_path / "g.ply").means, rows[:, :3], rtol=1e-6)
@@ -264,10 +267,8 @@ def test_infinite_logits_of_opacities_become_finite(tmp_path):
 @pytest.mark.long
 def test_flat_ellipsoids_show_the_same_whichever_axis_is_thin(tmp_path):
     """The same splats with their axes cycled, so that the first or the second is thin, are the same splats."""
-    gaussians, camera = (
-        some_gaussians(30),
-        Camera(jnp.eye(4).at[2, 3].set(5), jnp.diag(jnp.array([30.0, 30, 1])), 32, 24),
-    )
+    gaussians = some_gaussians(30)
+    camera = Camera(jnp.eye(4).at[2, 3].set(5), jnp.diag(jnp.array([30.0, 30, 1])), 32, 24)
     camera = dataclasses.replace(camera, K=camera.K.at[:2, 2].set(jnp.array([16.0, 12])))
     gaussians = dataclasses.replace(gaussians, log_scales=gaussians.log_scales + 1)
     save_ply(tmp_path / "flat.ply", gaussians)
@@ -298,7 +299,8 @@ def test_flat_gaussians_come_back_exactly_with_and_without_a_third_scale(tmp_pat
 
 def test_the_third_scale_of_splats_marked_as_flat_says_nothing(tmp_path):
     """Programs that round scales may leave another axis thinner."""
-    gaussians, path = some_gaussians(), tmp_path / "g.ply"
+    gaussians = some_gaussians()
+    path = tmp_path / "g.ply"
     path.write_bytes(encode_ply(gaussians, np.asarray(gaussians.log_scales.max(1, keepdims=True)) + 1))
     assert_same(load_ply(path), gaussians)
     path.write_bytes(path.read_bytes().replace(b"2dgs", b"mip "))
@@ -348,7 +350,8 @@ def test_missing_ply(tmp_path):
 @pytest.mark.parametrize("seed", range(2))
 def test_rotated_sh_have_the_same_colours(x64, seed):
     rng = np.random.default_rng(seed)
-    rotation, coefficients = Rotation.random(rng=rng).as_matrix(), rng.normal(size=16)
+    rotation = Rotation.random(rng=rng).as_matrix()
+    coefficients = rng.normal(size=16)
     directions = rng.normal(size=(20, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     before = sh_basis(jnp.asarray(directions)) @ coefficients

@@ -41,7 +41,8 @@ def test_lists_are_those_of_xla(monkeypatch, dtype):
     monkeypatch.setattr(native, "PAIRS_PER_THREAD", 100)
     monkeypatch.setattr(ffi, "num_threads", lambda: 3)
     scene = draw_scene(4, num=300)
-    gaussians, camera = as_gaussians(scene, dtype), as_camera(scene, dtype)
+    gaussians = as_gaussians(scene, dtype)
+    camera = as_camera(scene, dtype)
     M, _ = homographies(gaussians, camera)
     # Equal depths, to see ties in order of the index.
     splats = M.at[:, 2, 2].set(jnp.round(M[:, 2, 2], 1)), gaussian_cutoff(gaussians.opacities), 0.2
@@ -61,8 +62,10 @@ def test_lists_are_those_of_xla(monkeypatch, dtype):
 def test_threads_share_the_work_and_nothing_else(monkeypatch):
     """Images are bit for bit the same as with one thread; gradients, summed by thread, are equal to rounding."""
     scene = draw_scene(3, num=60)
-    gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
-    textures, settings = as_textures(scene, "float32"), RenderSettings(capacity=8192)
+    gaussians = as_gaussians(scene, "float32")
+    camera = as_camera(scene, "float32")
+    textures = as_textures(scene, "float32")
+    settings = RenderSettings(capacity=8192)
 
     @jax.jit
     def differentiate(gaussians, buckets):
@@ -110,7 +113,8 @@ class Halves(Appearance):
 @pytest.mark.usefixtures("x64")
 def test_any_appearance_is_compiled():
     scene = draw_scene(9, num=20, width=19, height=13)
-    gaussians, camera = as_gaussians(scene, "float64"), as_camera(scene, "float64")
+    gaussians = as_gaussians(scene, "float64")
+    camera = as_camera(scene, "float64")
     halves = jnp.asarray(np.random.default_rng(0).normal(size=(gaussians.num, 2, 3)))
 
     def loss(gaussians, halves, compositor):
@@ -135,7 +139,8 @@ class Untranslatable(Appearance):
 def test_an_appearance_without_translation_is_left_to_xla():
     """With "auto", with one warning that names the primitive; with "native" it is an error."""
     scene = draw_scene(9, num=8, width=16, height=16)
-    gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
+    gaussians = as_gaussians(scene, "float32")
+    camera = as_camera(scene, "float32")
 
     def show(**settings):
         return render_appearance(gaussians, camera, Untranslatable(), settings=RenderSettings(**settings)).color
@@ -166,7 +171,8 @@ def test_a_splat_without_a_texture_shows_its_gaussian(compositor, options):
     pairs = zip(is_empty, scene.textures, strict=True)
     neutral = [np.array([[[0.0, 0.0, 0.0, 1.0]]]) if none else texture for none, texture in pairs]
     empty = [np.zeros((0, 0, 4)) if none else texture for none, texture in zip(is_empty, neutral, strict=True)]
-    gaussians, camera = as_gaussians(scene, "float64"), as_camera(scene, "float64")
+    gaussians = as_gaussians(scene, "float64")
+    camera = as_camera(scene, "float64")
     settings = RenderSettings(compositor=compositor, capacity=1024)
 
     def loss(gaussians, buckets, probe, textures):
@@ -181,7 +187,8 @@ def test_a_splat_without_a_texture_shows_its_gaussian(compositor, options):
         (_, color), grads = found(gaussians, textures.buckets, jnp.zeros((16, 4)), textures)
         return color, grads[0], dataclasses.replace(textures, buckets=grads[1]).blocks(), grads[2]
 
-    wanted, found = differentiate(neutral), differentiate(empty)
+    wanted = differentiate(neutral)
+    found = differentiate(empty)
     # A neutral texel has a gradient, what is empty has none.
     for arrays in (wanted[2], found[2]):
         arrays[:] = [array for none, array in zip(is_empty, arrays, strict=True) if not none]
@@ -200,7 +207,8 @@ def test_mixed_precisions_are_composited_in_the_larger():
     Rounding decides here and there whether a splat reaches 1/255, which moves a gradient by that pixel's share.
     """
     scene = draw_scene(4)
-    gaussians, textures = as_gaussians(scene, "float32"), as_textures(scene, "float32")
+    gaussians = as_gaussians(scene, "float32")
+    textures = as_textures(scene, "float32")
 
     def loss(gaussians, buckets, camera):
         settings = RenderSettings(compositor="native", capacity=1024)

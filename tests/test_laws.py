@@ -53,7 +53,8 @@ def rotate_sh(sh: Float, rotation: Float) -> Float:
 @x64
 def test_textures_that_change_nothing():
     """Initial ones are none, a constant one of any size is its one texel, and colour is affine in RGB texels."""
-    scene, rng = draw_scene(1), np.random.default_rng(0)
+    scene = draw_scene(1)
+    rng = np.random.default_rng(0)
     textures = a2tg.allocate_textures(np.array([texture.shape[:2] for texture in scene.textures]))
     neutral = [np.asarray(texture) for texture in a2tg.texture_arrays(textures)]
     assert_same(rendered(scene._replace(textures=neutral)), rendered(scene._replace(textures=None)))
@@ -81,7 +82,8 @@ def test_order_of_the_gaussians_and_scale_and_sign_of_quaternions_do_not_matter(
 @x64
 @pytest.mark.parametrize("seed", [0, 1])
 def test_moving_world_and_camera_together(seed):
-    scene, rotation = draw_scene(seed), rotation_of(seed + 10)
+    scene = draw_scene(seed)
+    rotation = rotation_of(seed + 10)
     # The helper that moves worlds inverts the oracle's rotation.
     np.testing.assert_allclose(oracle.rotation_matrix(quaternion(rotation)), rotation, atol=1e-12)
     # The camera centre −Rcᵀt moves along only where Rc is a rotation to more digits than float32 has.
@@ -115,7 +117,8 @@ def test_tile_size_does_not_show():
 @x64
 def test_colors_mix_over_the_background():
     scene = draw_scene(6)
-    black, shown = rendered(scene._replace(background=np.zeros(3))), rendered(scene)
+    black = rendered(scene._replace(background=np.zeros(3)))
+    shown = rendered(scene)
     expected = black.color + (1 - black.alpha)[..., None] * jnp.asarray(scene.background)[None, None]
     np.testing.assert_allclose(shown.color, expected, atol=1e-12)
     np.testing.assert_array_equal(shown.depth, black.depth)

@@ -55,7 +55,8 @@ def test_no_warning_if_training_learns(scene):
 def checks_of(views, psnr, iterations=200, is_first=True, **options):
     """Iterations at which a check of these training views warns, if the PSNR stays the same, and its last warning."""
     check = LearningCheck(views, BatchOrder(views, 1, 0), iterations, "black", is_first=is_first, **options)
-    warned, text = [], ""
+    warned = []
+    text = ""
     for iteration in range(1, iterations + 1):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")

@@ -71,12 +71,11 @@ def test_many_steps_are_at_the_least_error():
     # Half a grey above zero, no colour is cut off before or after.
     model = dataclasses.replace(model, gaussians=dataclasses.replace(model.gaussians, sh=0.1 * model.gaussians.sh))
     model = dataclasses.replace(model, background=(0.25, 0.5, 0.75))
-    views, rng = some_views(model, camera, num=2), np.random.default_rng(1)
+    views = some_views(model, camera, num=2)
+    rng = np.random.default_rng(1)
     # One has an opacity and a mask.
-    alpha, mask = (
-        rng.integers(0, 256, views[0].image.shape[:2], np.uint8),
-        rng.uniform(size=views[0].image.shape[:2]) < 0.7,
-    )
+    alpha = rng.integers(0, 256, views[0].image.shape[:2], np.uint8)
+    mask = rng.uniform(size=views[0].image.shape[:2]) < 0.7
     views[0] = View("0.png", views[0].camera, np.dstack([views[0].image, alpha]), mask)
     counts = np.concatenate(
         [np.ravel(np.broadcast_to(own[..., None], views[0].image.shape)) for own in (mask, mask | True)]
@@ -85,7 +84,8 @@ def test_many_steps_are_at_the_least_error():
     flat, unflatten = jax.flatten_util.ravel_pytree(colors_of(model))
     draw = jax.jit(lambda change, camera: draw_change(model, unflatten(change), camera, settings).ravel())
     columns = [np.concatenate([draw(unit, view.camera) for view in views]) for unit in np.eye(len(flat))]
-    J, ridge = counts[:, None] * np.stack(columns, axis=1), 0.5
+    J = counts[:, None] * np.stack(columns, axis=1)
+    ridge = 0.5
     residual = np.concatenate(
         [np.ravel(view_image(v, model.background) - np.asarray(model.render(v.camera).color)) for v in views]
     )

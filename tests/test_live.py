@@ -26,7 +26,8 @@ class Clock:
     """A clock that is set by hand, or advances by `step` with each look."""
 
     def __init__(self, step: float = 0.0):
-        self.seconds, self.step = 0.0, step
+        self.seconds = 0.0
+        self.step = step
 
     def __call__(self) -> float:
         self.seconds += self.step
@@ -53,7 +54,8 @@ def status(live: LiveView) -> dict:
 
 def test_snapshots_and_figures():
     clock = Clock()
-    live, run = LiveView(SCENE, "scene", clock), stage_run()
+    live = LiveView(SCENE, "scene", clock)
+    run = stage_run()
     assert b'<html data-training="yes" ' in live.routes["/"].read()
     assert live.routes["/scene.a2tgz"].read() is None and status(live)["version"] == 0
     assert live(run, never) == 0
@@ -87,7 +89,8 @@ def test_slow_snapshots_are_rare():
 
 
 def test_pause_holds_the_training_until_it_is_resumed_or_stopped():
-    live, run = LiveView(SCENE, "scene"), stage_run()
+    live = LiveView(SCENE, "scene")
+    run = stage_run()
     app = application(live.routes, Door(port=80))
 
     def post(path: str, **more) -> str:

@@ -70,7 +70,8 @@ def test_first_and_second_derivatives_in_both_modes(monkeypatch, x64, is_native)
     """Forward mode is the gradient along a direction; second derivatives are differences of gradients."""
     monkeypatch.setattr(platforms, "has_native", lambda: is_native)
     image, target = map(jnp.asarray, random_pair(11, 18, 0.1))
-    direction, eps = jnp.sin(jnp.arange(image.size, dtype=image.dtype)).reshape(image.shape), 1e-6
+    direction = jnp.sin(jnp.arange(image.size, dtype=image.dtype)).reshape(image.shape)
+    eps = 1e-6
     gradient = jax.grad(lambda image: photometric_loss(image, target))
 
     def derivatives(image):

@@ -46,7 +46,8 @@ def ply_parts(data: bytes) -> tuple[list[str], np.ndarray]:
     head, _, body = data.partition(b"end_header\n")
     lines = head.decode().split("\n")
     kinds = {"float": "<f4", "double": "<f8", "uchar": "u1"}
-    dtype, num = [], 0
+    dtype = []
+    num = 0
     for words in (line.split() for line in lines):
         if words[:1] == ["element"] and words[1] != "vertex":
             break
@@ -224,7 +225,9 @@ def test_files_whose_nodes_lie_in_a_map_are_read_without_rounding(tmp_path, suff
         a2tg.save_gltf(tmp_path / "near.gltf", a2tg.Model(gaussians))
         file = json.loads((tmp_path / "near.gltf").read_text())
         del file["nodes"][0]["matrix"]
-        east, up, south = UTM[0], UTM[2], -UTM[1]
+        east = UTM[0]
+        up = UTM[2]
+        south = -UTM[1]
         file["nodes"] = [{"mesh": 0, "translation": [east, up + 5 * k, south]} for k in range(2)]
         file["scenes"][0]["nodes"] = [0, 1]
         path = tmp_path / "near.gltf"

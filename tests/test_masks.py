@@ -219,7 +219,8 @@ def test_alpha_is_transparency_or_a_mask(tmp_path):
         Image.fromarray(pixels).save(tmp_path / frame["file_path"])
     write_json(tmp_path, frames, **FOCAL, **SIZE)
     with pytest.warns(UserWarning, match="sparse points"):
-        transparent, masked = load_scene(tmp_path), load_scene(tmp_path, alpha="mask")
+        transparent = load_scene(tmp_path)
+        masked = load_scene(tmp_path, alpha="mask")
     for before, after in zip(views_of(transparent), views_of(masked), strict=True):
         assert before.mask is None and not after.has_alpha
         np.testing.assert_array_equal(after.mask.read(), before.alpha == 255)
@@ -271,7 +272,8 @@ def masked():
 
     def with_mask(view):
         mask = np.ones(view.picture.size, bool)
-        left, top = rng.integers(0, 20), rng.integers(0, 15)
+        left = rng.integers(0, 20)
+        top = rng.integers(0, 15)
         mask[top : top + 12, left : left + 14] = False
         return dataclasses.replace(view, mask=mask)
 

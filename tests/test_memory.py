@@ -45,7 +45,8 @@ def test_without_proc_nothing_happens(tmp_path):
 def test_training_calls_its_session_after_compiling(monkeypatch):
     """A limit of 0 memory mappings makes every compilation exceed it."""
     monkeypatch.setattr(machine, "LARGEST_SHARE", 0)
-    scene, dropped = synthetic_scene(num_views=3, width=24, height=16, num_points=40), []
+    scene = synthetic_scene(num_views=3, width=24, height=16, num_points=40)
+    dropped = []
     double = jax.jit(lambda x: 2 * x)
     double(jnp.ones(3))
 

@@ -45,7 +45,9 @@ def rays_of(camera):
 def sphere_depths(camera, radius=RADIUS):
     """Exact depths of a sphere around 0, coloured by its positions."""
     center, rays = rays_of(camera)
-    a, b, c = (rays**2).sum(-1), rays @ center, center @ center - radius**2
+    a = (rays**2).sum(-1)
+    b = rays @ center
+    c = center @ center - radius**2
     root = b * b - a * c
     depth = np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / a, 0)
     color = np.clip(0.5 + (center + rays * depth[..., None]), 0, 1)
@@ -106,7 +108,8 @@ def test_small_parts_are_dropped_and_counted(sphere, most, least_faces):
 
 def test_a_drawn_mesh_has_the_depths_that_it_was_fused_from(sphere):
     camera = camera_at(np.array([0.9, -0.6, 0.4]))
-    drawn, exact = draw_view(sphere, camera), np.asarray(sphere_depths(camera).depth)
+    drawn = draw_view(sphere, camera)
+    exact = np.asarray(sphere_depths(camera).depth)
     both = (drawn.face >= 0) & (exact > 0)
     assert both.sum() > 0.98 * (exact > 0).sum() > 300
     assert np.abs(drawn.depth - exact)[both].mean() < 0.1 / 60
@@ -119,7 +122,8 @@ def test_a_drawn_mesh_has_the_depths_that_it_was_fused_from(sphere):
 def test_distances_of_two_planes():
     square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
     faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
-    lower, upper = a2tg.Mesh(square, faces), a2tg.Mesh(square + np.array([0, 0, 0.1]), faces)
+    lower = a2tg.Mesh(square, faces)
+    upper = a2tg.Mesh(square + np.array([0, 0, 0.1]), faces)
     points = [surface_quality.thinned(a2tg.sample_surface(mesh, 0.01), 0.005) for mesh in (lower, upper)]
     found = a2tg.surface_distance(*points, threshold=0.15)
     assert found.accuracy == pytest.approx(0.1, rel=0.01) and found.completeness == pytest.approx(0.1, rel=0.01)
@@ -193,7 +197,8 @@ def test_the_mesh_and_the_splats_of_a_model_lie_on_each_other(model, tmp_path):
 @pytest.mark.parametrize("suffix", [".glb", ".ply", ".obj"])
 def test_all_files_of_a_mesh_are_known_before(tmp_path, suffix):
     own = {"uv": np.eye(3)[:, :2], "texture": np.zeros((4, 4, 3), np.uint8)}
-    mesh, path = a2tg.Mesh(np.eye(3), np.array([[0, 1, 2]], np.int32), **own), tmp_path / f"mesh{suffix}"
+    mesh = a2tg.Mesh(np.eye(3), np.array([[0, 1, 2]], np.int32), **own)
+    path = tmp_path / f"mesh{suffix}"
     assert a2tg.save_mesh(path, mesh) == mesh_files(path, has_texture=True)
     assert set(tmp_path.iterdir()) == set(mesh_files(path, has_texture=True))
 
@@ -294,7 +299,8 @@ def test_the_command_writes_the_original_world(model, tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "fused 14 views at voxels of 0.4, within 24 of the centre" in printed and "faces" in printed
     content = (tmp_path / "made.ply").read_bytes()
-    start, num = content.index(b"end_header\n") + 11, int(content.split(b"vertex ")[1].split()[0])
+    start = content.index(b"end_header\n") + 11
+    num = int(content.split(b"vertex ")[1].split()[0])
     kind = np.dtype([("position", "<f4", 3), ("color", "u1", 3)])
     positions = np.frombuffer(content, kind, num, start)["position"]
     assert np.median(np.linalg.norm(positions, axis=1)) == pytest.approx(RADIUS / 0.1, abs=0.4)
@@ -372,7 +378,8 @@ def textured(sphere):
 def test_texels_have_the_colors_that_the_views_see(textured):
     middle = textured.corners.mean(axis=1)
     places = textured.uv[textured.faces].mean(axis=1)
-    rows, columns = ((1 - places[:, 1]) * 128).astype(int), (places[:, 0] * 128).astype(int)
+    rows = ((1 - places[:, 1]) * 128).astype(int)
+    columns = (places[:, 0] * 128).astype(int)
     error = np.abs(textured.texture[rows, columns] / 255 - np.clip(0.5 + middle, 0, 1))
     assert np.median(error) < 0.02 and np.quantile(error, 0.95) < 0.1
 

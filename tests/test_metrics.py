@@ -28,7 +28,8 @@ def random_image(seed, shape=(24, 20, 3)):
 
 
 def test_psnr_and_ssim_equal_scikit_image_on_clipped_images(x64):
-    image, target = random_image(0), random_image(1)
+    image = random_image(0)
+    target = random_image(1)
     clipped = np.clip(image, 0, 1), np.clip(target, 0, 1)
     np.testing.assert_allclose(psnr(image, target), peak_signal_noise_ratio(*clipped, data_range=1), rtol=1e-12)
     wanted = structural_similarity(

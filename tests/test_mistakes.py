@@ -231,9 +231,14 @@ def test_values_that_may_be_none(words, value):
 # In Python: values that the code in the tables uses, besides the public names of the library
 
 CAMERA = a2tg.Camera(jnp.eye(4).at[2, 3].set(3), jnp.array([[20.0, 0, 8], [0, 20, 6], [0, 0, 1]]), 16, 12)
-IMAGE, MAP, SIZES, SCALES = jnp.ones((12, 16, 3)), jnp.ones((12, 16)), np.ones((7, 2), int), np.ones((7, 2), np.float32)
-SETTINGS, KEY = a2tg.RenderSettings(capacity=1024), jax.random.key(0)
-MODEL, GAUSSIANS = a2tg.Model(some_gaussians()), some_gaussians()
+IMAGE = jnp.ones((12, 16, 3))
+MAP = jnp.ones((12, 16))
+SIZES = np.ones((7, 2), int)
+SCALES = np.ones((7, 2), np.float32)
+SETTINGS = a2tg.RenderSettings(capacity=1024)
+KEY = jax.random.key(0)
+MODEL = a2tg.Model(some_gaussians())
+GAUSSIANS = some_gaussians()
 TEXTURES = a2tg.allocate_textures(SIZES)
 WRONG_TEXTURES = dataclasses.replace(TEXTURES, buckets=(jnp.ones((7, 1, 1, 3)),))
 TEXTURED = a2tg.Model(GAUSSIANS, Appearance(texture=a2tg.Texture(TEXTURES)))
@@ -660,7 +665,8 @@ def test_options_of_any_kind_of_number():
 def test_a_preset_takes_other_values_of_options():
     system = a2tg.A2tg.preset("quick", stage1_iterations=10, texture={"cap": 8}, rates=a2tg.LearningRates(quats=0.5))
     plain = a2tg.A2tg.preset("quick")
-    texture, rates = dataclasses.replace(plain.texture, cap=8), a2tg.LearningRates(quats=0.5)
+    texture = dataclasses.replace(plain.texture, cap=8)
+    rates = a2tg.LearningRates(quats=0.5)
     assert system == dataclasses.replace(plain, stage1_iterations=10, texture=texture, rates=rates)
 
 
@@ -677,7 +683,8 @@ def test_a_redefined_class_is_another_one():
 
 
 def test_a_capacity_that_is_too_small_warns_eagerly():
-    model, settings = a2tg.Model(some_gaussians(40)), a2tg.RenderSettings(capacity=1)
+    model = a2tg.Model(some_gaussians(40))
+    settings = a2tg.RenderSettings(capacity=1)
     with pytest.warns(a2tg.CapacityWarning, match=re.escape("plan_render(model, cameras)")) as caught:
         assert model.render(CAMERA, settings=settings).overflow
     assert caught[0].filename == __file__
@@ -739,7 +746,8 @@ def test_nan_in_a_ply_file(tmp_path):
 
 
 def test_depth_that_was_not_rendered_is_no_zero():
-    model, camera = a2tg.Model(a2tg.init_from_points(tiny().points, tiny().colors)), tiny().test[0].camera
+    model = a2tg.Model(a2tg.init_from_points(tiny().points, tiny().colors))
+    camera = tiny().test[0].camera
     arguments = model.gaussians, camera, model.appearance, jnp.zeros(3), dataclasses.replace(SETTINGS, supersample=2)
     output = jax.eval_shape(lambda: render_traced(*arguments, has_geometry=False)[0])
     assert output.alpha.shape == (16, 16) and output.geometry is None

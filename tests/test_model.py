@@ -226,7 +226,8 @@ def test_arrays_and_options_that_do_not_fit_are_refused(tmp_path, change, messag
 
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.long)])
 def test_flipped_bits_are_found_or_do_no_harm(tmp_path, seed):
-    path, rng = tmp_path / "bits.npz", np.random.default_rng(seed)
+    path = tmp_path / "bits.npz"
+    rng = np.random.default_rng(seed)
     save_model(path, textured_model())
     whole = path.read_bytes()
     for place in rng.integers(len(whole), size=100):
@@ -252,7 +253,8 @@ def test_a_model_of_wrong_shapes_is_not_written(tmp_path):
 
 def test_rows_of_another_number_are_refused(tmp_path):
     """Both numbers are named; four textures of seven Gaussians would otherwise move to the wrong ones."""
-    textures, few = textures_from_arrays(some_textures()), textures_from_arrays(some_textures(4))
+    textures = textures_from_arrays(some_textures())
+    few = textures_from_arrays(some_textures(4))
     model = Model(some_gaussians(), Appearance(texture=Texture(textures), exponents=Exponents(jnp.zeros(7))))
     coefficients = allocate_appearance(Appearance(bands=Bands()), jax.random.key(0), some_gaussians()[:4]).coefficients
     words = "are of 4 Gaussians, but there are 7"
@@ -289,19 +291,24 @@ def test_a_moved_model_shows_the_same_to_its_cameras():
     moved = model.transform(some_world())
 
     def first_view(model: Model):
-        viewmat, K = jnp.asarray(model.origin.viewmats[0]), jnp.asarray(model.origin.Ks[0])
+        viewmat = jnp.asarray(model.origin.viewmats[0])
+        K = jnp.asarray(model.origin.Ks[0])
         return model.render(
             Camera(viewmat, K, *model.origin.sizes[0].tolist()), settings=RenderSettings(near_plane=1e-3)
         )
 
-    before, after = first_view(model), first_view(moved)
+    before = first_view(model)
+    after = first_view(moved)
     np.testing.assert_allclose(after.color, before.color, atol=1e-9)
     assert before.alpha.mean() > 0.2
 
 
 def test_moves_compose():
-    model, first, second = textured_model(), some_world(1), some_world(2)
-    twice, once = model.transform(first).transform(second), model.transform(first.then(second))
+    model = textured_model()
+    first = some_world(1)
+    second = some_world(2)
+    twice = model.transform(first).transform(second)
+    once = model.transform(first.then(second))
     np.testing.assert_allclose(twice.gaussians.means, once.gaussians.means, atol=1e-5)
     np.testing.assert_allclose(twice.origin.viewmats, once.origin.viewmats, atol=1e-12)
     np.testing.assert_allclose(twice.origin.transform.translation, once.origin.transform.translation, atol=1e-12)
@@ -313,7 +320,8 @@ def test_moves_compose():
 @pytest.mark.long
 def test_dead_rows_do_not_show():
     scene = draw_scene(4)
-    gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
+    gaussians = as_gaussians(scene, "float32")
+    camera = as_camera(scene, "float32")
     spoiled = jax.tree.map(lambda x: x.at[10:].set(jnp.nan), gaussians)
     model = Model(spoiled, num_live=jnp.asarray(10, jnp.int32))
     expected = render_appearance(gaussians[:10], camera, Appearance())

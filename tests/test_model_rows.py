@@ -40,7 +40,8 @@ def moved(tree):
 
 def some_model(name: str, seed: int = 2, num: int = NUM) -> Model:
     """A model of `num` Gaussians, behind which two rows do not exist."""
-    gaussians, template = as_gaussians(draw_scene(seed, num=num + 2), "float32"), APPEARANCES[name]
+    gaussians = as_gaussians(draw_scene(seed, num=num + 2), "float32")
+    template = APPEARANCES[name]
     if template.bands is not None:
         gaussians = dataclasses.replace(gaussians, sh=gaussians.sh[:, :1])
     appearance = moved(allocate_appearance(template, jax.random.key(seed), gaussians))
@@ -103,7 +104,8 @@ def test_rows_are_chosen_by_mask_indices_and_slice(name):
 
 @every_appearance
 def test_models_are_joined(name):
-    first, second = some_model(name), some_model(name, seed=3, num=5)
+    first = some_model(name)
+    second = some_model(name, seed=3, num=5)
     assert_rows(concatenate([first, second, first]), rows_of(first) + rows_of(second) + rows_of(first))
     assert_rows(concatenate([first]), rows_of(first))
     assert_rows(concatenate([first[:0], second]), rows_of(second))
@@ -112,7 +114,8 @@ def test_models_are_joined(name):
 
 
 def test_lower_degrees_are_filled_up():
-    first, second = some_model("plain"), some_model("plain", seed=3)
+    first = some_model("plain")
+    second = some_model("plain", seed=3)
     flat = dataclasses.replace(first, gaussians=dataclasses.replace(first.gaussians, sh=first.gaussians.sh[:, :1]))
     joined = concatenate([flat, second])
     assert joined.gaussians.sh_degree == 3 and not np.any(joined.sh[:NUM, 1:])
@@ -167,7 +170,8 @@ def test_an_event_may_leave_fewer_rows_or_more(rows, name="exponents"):
     model = some_model(name)
     moments = adam_init(partition(model)[0])
     moments = dataclasses.replace(moments, mu=moved(moments.mu))
-    found, found_moments = gather_rows(model, np.asarray(rows)), gather_moments(moments, np.asarray(rows))
+    found = gather_rows(model, np.asarray(rows))
+    found_moments = gather_moments(moments, np.asarray(rows))
     assert found.gaussians.num == len(rows)
     for before, after in ((model.gaussians, found.gaussians), (model.appearance, found.appearance)):
         jax.tree.map(lambda b, a: np.testing.assert_array_equal(np.asarray(b)[rows], a), before, after)

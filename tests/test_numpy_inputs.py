@@ -65,10 +65,12 @@ def test_cameras_and_textures(kind, wanted):
 def test_images_features_backgrounds_and_points(kind):
     for score in (a2tg.photometric_loss, a2tg.psnr, a2tg.ssim):
         np.testing.assert_array_equal(score(kind(IMAGE), kind(IMAGE[::-1])), score(IMAGE, IMAGE[::-1]))
-    features, background = IMAGE[0, :20, :2], np.asarray([0.25, 0.5], np.float32)
+    features = IMAGE[0, :20, :2]
+    background = np.asarray([0.25, 0.5], np.float32)
     given = image(features=kind(features), background=kind(background))
     np.testing.assert_array_equal(given, image(features=features, background=background))
-    points, colors = IMAGE[0], IMAGE[1]
+    points = IMAGE[0]
+    colors = IMAGE[1]
     own, other = (a2tg.init_from_points(*pair) for pair in ((kind(points), kind(colors)), (points, colors)))
     assert all(map(np.array_equal, jax.tree.leaves(own), jax.tree.leaves(other)))
 

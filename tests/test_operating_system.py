@@ -22,7 +22,9 @@ from a2tg_jax.host import signals
 from a2tg_jax.rasterize.kernels.native import composite as native, ffi
 
 ROOT = Path(__file__).parents[1]
-NOT_LOCKED, TAKEN, NO_LOCKS = None, "taken", OSError(95, "Operation not supported")
+NOT_LOCKED = None
+TAKEN = "taken"
+NO_LOCKS = OSError(95, "Operation not supported")
 
 
 @pytest.fixture
@@ -153,7 +155,8 @@ def without_encoding(path):
     """Lines of a module that read or write text in the encoding of the system, which on Windows is not UTF-8."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Call) and "encoding" not in {each.arg for each in node.keywords}:
-            name, mode = ast.unparse(node.func), [*map(ast.unparse, node.args[1:2]), "'r'"][0]
+            name = ast.unparse(node.func)
+            mode = [*map(ast.unparse, node.args[1:2]), "'r'"][0]
             if name.endswith((".read_text", ".write_text")) or (name == "open" and "b" not in mode):
                 yield f"{path.name}:{node.lineno}"
 
@@ -251,7 +254,9 @@ def test_a_set_number_precedes_the_environment(monkeypatch, threads):
 
 
 def test_rendering_uses_that_number_of_threads(monkeypatch, threads):
-    parts, run_spans, scene = [], ffi.run_spans, draw_scene(3, num=60)
+    parts = []
+    run_spans = ffi.run_spans
+    scene = draw_scene(3, num=60)
     monkeypatch.setattr(native, "PAIRS_PER_THREAD", 1)
     monkeypatch.setattr(ffi, "run_spans", lambda work, spans: (parts.append(len(spans)), run_spans(work, spans)))
     for num in (1, 3):

@@ -15,7 +15,8 @@ from a2tg_jax.training.step import initial_state, optimized
 
 def oracle_adam(param, grads, rate, b1=0.9, b2=0.999, eps=1e-15):
     """Adam step by step, as Kingma & Ba write it."""
-    m, v = np.zeros_like(param), np.zeros_like(param)
+    m = np.zeros_like(param)
+    v = np.zeros_like(param)
     for step, grad in enumerate(grads, start=1):
         m = b1 * m + (1 - b1) * grad
         v = b2 * v + (1 - b2) * grad**2
@@ -65,7 +66,8 @@ def test_first_step_moves_by_the_rate():
 
 
 def test_without_decay_the_present_gradient_alone_counts():
-    params, state = jnp.zeros(2), adam_init(jnp.zeros(2))
+    params = jnp.zeros(2)
+    state = adam_init(jnp.zeros(2))
     for grads in ([4.0, -3.0], [5.0, -1.0]):
         params, state = adam_update(params, jnp.asarray(grads), state, 0.1, b1=0.0, b2=0.0)
     np.testing.assert_allclose(params, [-0.2, 0.2], rtol=1e-6)
@@ -83,7 +85,8 @@ def test_one_rate_may_be_of_a_subtree():
 def test_traced_rates_do_not_retrace():
     traces = []
     update = jax.jit(lambda params, state, rate: traces.append(None) or adam_update(params, params, state, rate))
-    params, state = jnp.ones(2), adam_init(jnp.ones(2))
+    params = jnp.ones(2)
+    state = adam_init(jnp.ones(2))
     for iteration in range(1, 4):
         params, state = update(params, state, exponential_decay(1e-2, 0.01, iteration, 3))
     assert len(traces) == 1

@@ -13,7 +13,8 @@ EDGE_ON = [np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0]
 
 def hand_scene(means, quats, log_scales, opacities, colors, textures=None, background=(0.0, 0.0, 0.0)) -> Scene:
     """Splats of constant colour before a camera at the origin that looks along +z, 16×12 pixels."""
-    opacities, sh = np.array(opacities), np.zeros((len(means), 16, 3))
+    opacities = np.array(opacities)
+    sh = np.zeros((len(means), 16, 3))
     sh[:, 0] = (np.array(colors) - 0.5) * np.sqrt(4 * np.pi)
     splats = *(np.array(x, float) for x in (means, quats, log_scales)), np.log(opacities / (1 - opacities)), sh
     K = np.array([[FOCAL, 0, 8], [0, FOCAL, 6], [0, 0, 1]])

@@ -22,9 +22,11 @@ from small_values import some_gaussians
 from a2tg_jax import Gaussians, Model, load_ply, load_splats, save_splats
 
 OTHERS = Path(__file__).parent / "data" / "others"
-NUM, C0 = 90, 1 / (2 * np.sqrt(np.pi))
+NUM = 90
+C0 = 1 / (2 * np.sqrt(np.pi))
 HEADER, SECTION = 4096, 1024
-LEVEL1, LEVEL2 = OTHERS / "level1-degree2.ksplat", OTHERS / "level2-degree2.ksplat"
+LEVEL1 = OTHERS / "level1-degree2.ksplat"
+LEVEL2 = OTHERS / "level2-degree2.ksplat"
 
 
 def scene() -> dict[str, np.ndarray]:
@@ -79,7 +81,8 @@ def check(
     ],
 )
 def test_files_of_other_programs_hold_their_numbers(name, num_rest, tolerances):
-    found, wanted = numbers(load_splats(OTHERS / name).gaussians), scene()
+    found = numbers(load_splats(OTHERS / name).gaussians)
+    wanted = scene()
     assert found["rest"].shape == (NUM, num_rest, 3)
     if name.endswith(".sog"):
         wanted["rest"] = sog_palette(OTHERS / name)[match(wanted["means"], found["means"])]
@@ -106,8 +109,10 @@ def sog_palette(path: Path) -> np.ndarray:
 
 def test_glb_of_splat_transform():
     """It takes a PLY for a world whose +y is down, and turns it half about z; this library turns +y into +z after."""
-    gaussians, wanted = load_splats(OTHERS / "scene.glb").gaussians, scene()
-    found, turn = numbers(gaussians), np.array([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]])
+    gaussians = load_splats(OTHERS / "scene.glb").gaussians
+    wanted = scene()
+    found = numbers(gaussians)
+    turn = np.array([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]])
     np.testing.assert_allclose(found["means"], wanted["means"] @ turn.T, atol=1e-5)
     np.testing.assert_allclose(found["log_scales"], wanted["log_scales"], atol=1e-5)
     np.testing.assert_allclose(found["opacities"], wanted["opacities"], atol=1e-5)
@@ -162,9 +167,11 @@ def smallest_three(quat: np.ndarray) -> int:
 @pytest.mark.parametrize("degree", range(4))
 def test_ksplat_is_what_gaussian_splats_3d_counts_and_reads(tmp_path, degree):
     """One section of compression level 0: rows of floats, but for four bytes of colour."""
-    gaussians, kept = load_ply(OTHERS / "scene.ply"), min(degree, 2)
+    gaussians = load_ply(OTHERS / "scene.ply")
+    kept = min(degree, 2)
     save_splats(tmp_path / "a.ksplat", Model(dataclasses.replace(gaussians, sh=gaussians.sh[:, : (degree + 1) ** 2])))
-    data, num_rest = (tmp_path / "a.ksplat").read_bytes(), 3 * ((kept + 1) ** 2 - 1)
+    data = (tmp_path / "a.ksplat").read_bytes()
+    num_rest = 3 * ((kept + 1) ** 2 - 1)
     assert data[:4] == bytes([0, 1, 0, 0])
     assert np.frombuffer(data, "<u4", 4, 4).tolist() == [1, 1, NUM, NUM]  # Sections and splats, most and present.
     assert np.frombuffer(data, "<u2", 1, 20) == 0
@@ -173,7 +180,9 @@ def test_ksplat_is_what_gaussian_splats_3d_counts_and_reads(tmp_path, degree):
     assert np.frombuffer(data, "<u2", 1, HEADER + 40) == kept
     rows = np.frombuffer(data[HEADER + SECTION :], np.uint8).reshape(NUM, 44 + 4 * num_rest)
     floats = lambda columns: np.ascontiguousarray(rows[:, columns]).view("<f4").astype(np.float64)  # noqa: E731
-    body, colors, rest = floats(slice(0, 40)), rows[:, 40:44] / 255, floats(slice(44, None))
+    body = floats(slice(0, 40))
+    colors = rows[:, 40:44] / 255
+    rest = floats(slice(44, None))
     bands = [(0, 3), (9, 5)][:kept]  # Start and width of each degree; red first, then green, then blue.
     parts = [
         rest[:, start : start + 3 * width].reshape(NUM, 3, width).transpose(0, 2, 1) for start, width in bands
@@ -200,7 +209,8 @@ def test_splat_has_rows_of_32_bytes(tmp_path):
 
 def test_ksplat_sections_of_different_degrees(tmp_path):
     """Two files made one by hand: the first 90 splats lack the coefficients that the others have."""
-    gaussians, parts = load_ply(OTHERS / "scene.ply"), []
+    gaussians = load_ply(OTHERS / "scene.ply")
+    parts = []
     for degree in (0, 1):
         save_splats(tmp_path / "a.ksplat", Model(dataclasses.replace(gaussians, sh=gaussians.sh[:, : 1 + 3 * degree])))
         data = (tmp_path / "a.ksplat").read_bytes()

@@ -16,7 +16,8 @@ from a2tg_jax.data.decoding import picture_facts
 from a2tg_jax.data.panoramas import projection_of
 from a2tg_jax.data.staging import cut_view, directions, view_size
 
-CENTER, TARGET = np.array([0.3, -1.2, 1.2]), (0, 0.1, 0.45)
+CENTER = np.array([0.3, -1.2, 1.2])
+TARGET = (0, 0.1, 0.45)
 WIDTH, FACE = 640, 224
 
 
@@ -49,7 +50,8 @@ def panorama(surfaces):
     )
     rays = np.stack([np.cos(latitude) * np.sin(longitude), -np.sin(latitude), np.cos(latitude) * np.cos(longitude)], -1)
     seen = np.zeros((*rays.shape[:2], 3))
-    axis, focal = np.abs(rays).argmax(-1), FACE / 2
+    axis = np.abs(rays).argmax(-1)
+    focal = FACE / 2
     for number in range(3):
         for sign in (1, -1):
             z = sign * np.eye(3)[number]
@@ -88,7 +90,8 @@ def test_views_show_every_direction():
 
 SIDE = WIDTH // 2
 ROWS, COLUMNS = np.mgrid[0:SIDE, 0:WIDTH]
-ABOVE, BELOW = (ROWS < 0.42 * SIDE)[..., None], (ROWS > 0.6 * SIDE)[..., None]
+ABOVE = (ROWS < 0.42 * SIDE)[..., None]
+BELOW = (ROWS > 0.6 * SIDE)[..., None]
 FROM_MIDDLE = np.hypot(2 * COLUMNS / WIDTH - 1, 2 * ROWS / SIDE - 1)[..., None]
 """Distance from the middle of a picture, in half sides."""
 ROUND = np.hypot(*(np.mgrid[0:SIDE, 0:SIDE] - SIDE / 2 + 0.5))[..., None] / SIDE
@@ -276,7 +279,8 @@ def rig_scene(request, tmp_path):
 def test_the_views_of_a_panorama_are_held_out_together(rig_scene):
     kind, folder = rig_scene
     scene = load_scene(folder, test_every=2)
-    sizes, common = [], []
+    sizes = []
+    common = []
     for made in (scene, with_validation_views(scene)):
         train, test = ([PurePosixPath(view.name).stem for view in views] for views in (made.train, made.test))
         sizes.append((len(train), len(test)))

@@ -15,7 +15,8 @@ from a2tg_jax.io.path_file import load_views
 @pytest.mark.parametrize(("width", "height"), [(80, 60), (60, 80)])
 def test_a_camera_looks_at_its_target_with_a_level_horizon(width, height):
     """The target is in the middle, what is above it above, and the image's border at half the angle of view."""
-    position, target = np.asarray([1.0, -3.0, 0.5]), np.asarray([0.2, 0.4, -0.3])
+    position = np.asarray([1.0, -3.0, 0.5])
+    target = np.asarray([0.2, 0.4, -0.3])
     camera = look_at(position, target, width=width, height=height, fov=50)
 
     def seen(point):
@@ -107,7 +108,8 @@ def ring(num: int = 12, rolled: float = 0.0) -> list[Camera]:
 def test_a_turntable_is_a_level_closed_loop_around_the_subject():
     orbit = turntable(ring(rolled=0.05), 36)
     viewmats = np.array([camera.viewmat for camera in orbit], np.float64)
-    centers, up = centers_of(viewmats), vertical_of(np.array([c.viewmat for c in ring(rolled=0.05)]))
+    centers = centers_of(viewmats)
+    up = vertical_of(np.array([c.viewmat for c in ring(rolled=0.05)]))
     assert up[2] > 0.995
     to_subject = [1, 2, 3] - centers
     np.testing.assert_allclose(np.linalg.norm(to_subject, axis=1), 4.0, rtol=1e-4)

@@ -21,7 +21,8 @@ def ball_views(count=8, size=60):
     views = []
     for angle in 2 * np.pi * np.arange(count) / count:
         camera = a2tg.look_at([4 * np.cos(angle), 4 * np.sin(angle), 1.0], [0, 0, 0], width=size, height=size)
-        viewmat, K = np.asarray(camera.viewmat, float), np.asarray(camera.K, float)
+        viewmat = np.asarray(camera.viewmat, float)
+        K = np.asarray(camera.K, float)
         pixels = np.stack([*np.meshgrid(np.arange(size) + 0.5, np.arange(size) + 0.5), np.ones((size, size))], axis=-1)
         rays = pixels @ np.linalg.inv(K).T @ viewmat[:3, :3]
         center = -viewmat[:3, :3].T @ viewmat[:3, 3]
@@ -103,7 +104,8 @@ def test_the_air_before_a_plain_background_has_no_points(candidates):
     def opaque(behind):
         return lambda image: np.where(image[..., 3:] > 0, image[..., :3], behind).astype(np.uint8)
 
-    plain, wall = 255, np.random.default_rng(0).integers(0, 256, (60, 60, 3))
+    plain = 255
+    wall = np.random.default_rng(0).integers(0, 256, (60, 60, 3))
     assert len(agreeing_points(looks_at_ball(change=opaque(plain)), candidates, 5_000)[0]) == 0
     assert len(agreeing_points(looks_at_ball(change=opaque(wall)), candidates, 5_000)[0]) > 300
 
@@ -122,7 +124,8 @@ def test_the_start_does_not_depend_on_validation_views_and_leaves_no_view_withou
     places = [np.array([np.cos(place), np.sin(place), 0]) for place in range(16)]
     headings = [np.array([np.cos(turn), np.sin(turn), 0]) for turn in np.arange(6) * np.pi / 3]
     cameras = [a2tg.look_at(place, place + turn, width=24, height=24) for place in places for turn in headings]
-    viewmats, K = np.stack([camera.viewmat for camera in cameras]), cameras[0].K
+    viewmats = np.stack([camera.viewmat for camera in cameras])
+    K = cameras[0].K
 
     def load(images):
         with pytest.warns(UserWarning, match="starts from [0-9,]+ points where photographs agree"):

@@ -101,7 +101,8 @@ def test_batches_are_of_the_same_bits_wherever_photographs_are(tmp_path, kind, c
 def test_training_gives_the_same_bits_wherever_photographs_are(tmp_path, monkeypatch):
     """Compared with photographs in memory, brought to the device batch by batch. The threads end with training."""
     monkeypatch.setattr(loop, "PhotoStore", lambda *given: PhotoStore(*given, room=0))
-    models, seen = [], []
+    models = []
+    seen = []
     for scene in of_kind(tmp_path / "scene", "undistorted", None, 0):
         keep = lambda _: seen.append(num_readers())  # noqa: E731
         models.append(fit(scene, SYSTEM, on_checkpoint=keep, progress=False).model)
@@ -120,7 +121,8 @@ def test_memory_takes_as_many_photographs_as_it_has_room_for(tmp_path):
 @pytest.mark.parametrize("room", [None, 0])
 def test_photographs_stay_on_no_device_if_one_process_lacks_the_room(monkeypatch, room):
     """Three cases: another process has no room, this one has none, both have some."""
-    views, given = built_in().train, []
+    views = built_in().train
+    given = []
     for other in (False, True):
         monkeypatch.setattr(batches, "any_process", lambda _, own, other=other: given.append(own) or own or other)
         store = PhotoStore(views, BatchOrder(views, 1, 0), 12, room=room)
@@ -145,7 +147,8 @@ def test_photographs_that_other_processes_draw_are_not_read(monkeypatch):
 
     def counted(view):
         load = lambda: read.append(view.name) or np.full((32, 40, 4), 9, np.uint8)  # noqa: E731
-        picture, depth = Picture((32, 40, 4), load), np.ones((32, 40), np.float32)
+        picture = Picture((32, 40, 4), load)
+        depth = np.ones((32, 40), np.float32)
         return dataclasses.replace(view, picture=picture, mask=np.ones((32, 40), bool), depth=depth)
 
     views = tuple(map(counted, built_in().train))
@@ -200,7 +203,8 @@ def test_batches_are_made_ahead_in_order_and_errors_stay_with_theirs():
 
 
 def test_shelves_are_filled_and_read_by_many_threads():
-    shelf, images = Shelf(0), [np.full((7, 5, 3), value, np.uint8) for value in range(60)]
+    shelf = Shelf(0)
+    images = [np.full((7, 5, 3), value, np.uint8) for value in range(60)]
     kept: dict[int, Picture] = {}
 
     def work(start):

@@ -14,7 +14,9 @@ import a2tg_jax as a2tg
 from a2tg_jax import Due, PlaceByError, View, adam_init, partition
 from a2tg_jax.densify.placing import OPACITY, gaussians_at_errors
 
-DEPTH, FOCAL, SIZE = 4.0, 20.0, (16, 24)
+DEPTH = 4.0
+FOCAL = 20.0
+SIZE = (16, 24)
 K = np.array([[FOCAL, 0, 12], [0, FOCAL, 8], [0, 0, 1]], np.float32)
 TILT = 0.5
 """Slope of the wall: its depth grows by this for each unit to the right."""
@@ -83,7 +85,8 @@ def test_they_are_on_the_surface_at_the_wrong_pixels_and_of_their_colour():
 
 def test_pixels_are_drawn_in_proportion_to_their_error_in_all_views():
     """Differences of 252 and 126: two thirds of the Gaussians are at the former, in two views or in one."""
-    black, dark = photograph(2, 4, (0, 0, 0)), photograph(20, 22, (126, 0, 0))
+    black = photograph(2, 4, (0, 0, 0))
+    dark = photograph(20, 22, (126, 0, 0))
     for views in ([seen(black), seen(dark)], [seen(np.minimum(black, dark))]):
         columns = columns_of(placed(views, 3_000))
         assert abs(np.mean(columns < 4) - 2 / 3) < 0.04 and abs(np.mean(columns > 20) - 1 / 3) < 0.04
@@ -119,7 +122,8 @@ def applied(event: PlaceByError, model: a2tg.Model, views: list[View]):
 
 
 def test_the_event_adds_a_share_up_to_the_cap():
-    model, views = wall(), [seen(photograph(5, 8, (0, 0, 255)))]
+    model = wall()
+    views = [seen(photograph(5, 8, (0, 0, 255)))]
     change = applied(PlaceByError(share=1.0, cap=100), model, views)
     assert change.model.num == 2 and change.rows is None and change.unused is None
     assert change.model.gaussians.num == model.gaussians.num, "no row is allocated"
@@ -136,7 +140,8 @@ def test_the_event_adds_a_share_up_to_the_cap():
 
 
 def test_appearance_of_new_rows_is_the_initial_one():
-    model, views = wall(), [seen(photograph(5, 8, (0, 0, 255)))]
+    model = wall()
+    views = [seen(photograph(5, 8, (0, 0, 255)))]
     shapes = jnp.full(31, 0.3)
     model = dataclasses.replace(model, appearance=a2tg.Appearance(exponents=a2tg.Exponents(shapes)))
     change = applied(PlaceByError(share=1.0), model, views)

@@ -157,9 +157,11 @@ def assert_drawn_like_xla(found):
 
 @pytest.mark.long
 def test_kernels_that_agree_with_xla_are_used_and_checked_once(a_gpu, monkeypatch):
-    checked, run = [], check.largest_difference
+    checked = []
+    run = check.largest_difference
     monkeypatch.setattr(check, "largest_difference", lambda device: checked.append(run(device)) or checked[-1])
-    launched, launch_it = [], composite.launch
+    launched = []
+    launch_it = composite.launch
     monkeypatch.setattr(composite, "launch", lambda *given: launched.append(given[1]) or launch_it(*given))
     assert_drawn_like_xla(drawn())
     assert launched == ["forward", "backward", "forward"] and len(checked) == 1

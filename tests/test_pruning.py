@@ -39,10 +39,8 @@ def test_weights_are_those_of_the_oracle(seed):
 
 @pytest.mark.long
 def test_weights_are_summed_over_views_of_any_size():
-    model, camera = (
-        Model(some_state()[0].gaussians),
-        a2tg.synthetic_scene(num_views=3, width=24, height=16).train[0].camera,
-    )
+    model = Model(some_state()[0].gaussians)
+    camera = a2tg.synthetic_scene(num_views=3, width=24, height=16).train[0].camera
     views = [seen_from(one) for one in (camera, dataclasses.replace(camera, width=20, height=10), camera)]
     parts = [shown_in(model, [view]).weights for view in views]
     np.testing.assert_allclose(shown_in(model, views).weights, sum(parts), rtol=1e-6)
@@ -63,7 +61,8 @@ def pruned(event: Prune):
     moments = adam_init(partition(model)[0])
     numbers = jnp.arange(model.gaussians.num, dtype=jnp.float32)
     by_row = lambda x: jnp.broadcast_to(numbers.reshape(-1, *[1] * (x.ndim - 1)), x.shape)  # noqa: E731
-    mu, nu = jax.tree.map(by_row, moments.mu), jax.tree.map(lambda x: 2 * by_row(x), moments.nu)
+    mu = jax.tree.map(by_row, moments.mu)
+    nu = jax.tree.map(lambda x: 2 * by_row(x), moments.nu)
     moments = dataclasses.replace(moments, mu=mu, nu=nu)
     change = event.apply(Due(views=[seen_from(camera)]), model, moments, ())
     return model, camera, statistics, change
@@ -74,7 +73,8 @@ def test_those_that_show_least_go_and_all_of_a_gaussian_moves_along():
     weights = shown_in(model, [seen_from(camera)]).weights
     left = int(change.model.num_live)
     assert left == model.num - round(0.9 * model.num)
-    kept, gone = change.rows[:left], change.rows[left : model.num]
+    kept = change.rows[:left]
+    gone = change.rows[left : model.num]
     assert weights[kept].min() >= weights[gone].max() > 0
     np.testing.assert_array_equal(change.rows[model.num :], np.arange(model.num, model.gaussians.num))
     assert (np.diff(kept) > 0).all()

@@ -73,7 +73,8 @@ def test_every_pixel_of_a_fisheye_sees_along_its_own_ray(x64):
 @BOTH
 def test_gradients_through_rays_are_those_of_finite_differences(x64, compositor):
     scene = draw_scene(6, num=15)
-    camera, gaussians = fisheye(as_camera(scene, "float64")), as_gaussians(scene, "float64")
+    camera = fisheye(as_camera(scene, "float64"))
+    gaussians = as_gaussians(scene, "float64")
     settings = a2tg.plan_render(gaussians, [camera], settings=a2tg.RenderSettings(compositor=compositor))
     weights = jnp.asarray(np.random.default_rng(0).normal(size=(HEIGHT, WIDTH, 3)))
 
@@ -101,7 +102,8 @@ def test_gradients_through_rays_are_those_of_finite_differences(x64, compositor)
 def test_statistics_do_not_depend_on_the_image_plane(x64, statistic):
     """The rays of a pinhole camera, in the image plane of a focal length four times shorter."""
     scene = draw_scene(8, num=20)
-    camera, gaussians = as_camera(scene, "float64"), as_gaussians(scene, "float64")
+    camera = as_camera(scene, "float64")
+    gaussians = as_gaussians(scene, "float64")
     wide = dataclasses.replace(camera, K=camera.K * jnp.asarray([[0.25], [0.25], [1.0]]))
     in_plane = pinhole_rays(wide, np.asarray(camera.K))
     settings = a2tg.RenderSettings(capacity=CAPACITY)
@@ -156,14 +158,16 @@ def test_pixels_without_a_ray_see_the_background(x64):
     hidden = np.zeros((HEIGHT, WIDTH), bool)
     hidden[:8, :8], hidden[20, 30] = True, True
     blind = dataclasses.replace(camera, rays=jnp.where(hidden[..., None], jnp.nan, camera.rays))
-    gaussians, textures = as_gaussians(scene, "float64"), as_textures(scene, "float64")
+    gaussians = as_gaussians(scene, "float64")
+    textures = as_textures(scene, "float64")
     settings = a2tg.RenderSettings(capacity=CAPACITY)
 
     @jax.jit
     def seen(means, camera):
         return a2tg.render_image(dataclasses.replace(gaussians, means=means), camera, textures, settings=settings)
 
-    found, wanted = seen(gaussians.means, blind), seen(gaussians.means, camera)
+    found = seen(gaussians.means, blind)
+    wanted = seen(gaussians.means, camera)
     assert np.asarray(wanted.alpha)[hidden].max() > 0.1 and not np.asarray(found.alpha)[hidden].any()
     # A tile's frame, and with it the low-pass filter, follows from the rays that it has.
     np.testing.assert_allclose(np.asarray(found.color)[~hidden], np.asarray(wanted.color)[~hidden], atol=1e-5)
@@ -241,7 +245,8 @@ def test_rays_stay_on_the_device_if_those_of_all_lenses_fit(kept, lacking):
 
 def test_rays_that_come_with_batches_count_twice(kept, monkeypatch):
     """The forecast counts the rays of two batches in flight, and those that stay on the device once."""
-    of_rays, counted = ray_bytes(kept.train), []
+    of_rays = ray_bytes(kept.train)
+    counted = []
     for room in (of_rays, of_rays - 1):
         monkeypatch.setattr(batches, "device_room", lambda room=room: room)
         counted.append(fed_bytes(kept.train, 1, has_depths=False))

@@ -29,7 +29,8 @@ def test_checksums_hold():
 @pytest.mark.parametrize("name", FILES)
 def test_the_reference_reader_finds_what_this_library_finds(reference, name):
     read_model, _ = reference
-    found, wanted = read_model(DATA / name), numbers(load(DATA / name))
+    found = read_model(DATA / name)
+    wanted = numbers(load(DATA / name))
     assert set(found) == {*wanted, "header"} and len(found["means"]) == NUM
     for key, values in wanted.items():
         np.testing.assert_allclose(found[key], values, atol=2e-6, rtol=2e-6, err_msg=key)
@@ -40,7 +41,8 @@ def test_the_reference_reader_finds_what_this_library_finds(reference, name):
 def test_what_is_read_is_drawn_as_this_library_draws_it(reference, tmp_path, has_shapes):
     """It follows the rules of the page alone."""
     read_model, draw = reference
-    model, options = shaped_model() if has_shapes else reference_model(), {"outside": "identity", "extent": 1.5}
+    model = shaped_model() if has_shapes else reference_model()
+    options = {"outside": "identity", "extent": 1.5}
     texture = dataclasses.replace(model.appearance.texture, options=TextureOptions(**options))
     model = dataclasses.replace(model, appearance=dataclasses.replace(model.appearance, texture=texture))
     for name in ("m.npz", "m.glb"):

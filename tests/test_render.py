@@ -63,7 +63,8 @@ def test_float64(case):
 @pytest.mark.parametrize("compositor", quick_then_long(["native"], ["xla"]))
 @pytest.mark.parametrize("option", quick_then_long(["all"], [name for name in OPTIONS if name != "all"]))
 def test_float64_options(option, compositor):
-    scene, rules = draw_scene(9), OPTIONS[option]
+    scene = draw_scene(9)
+    rules = OPTIONS[option]
     output = render_scene(scene, "float64", as_settings(rules, compositor=compositor))
     assert_equal_in_float64(scene, rules, output)
 

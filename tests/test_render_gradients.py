@@ -52,7 +52,8 @@ class Inputs(NamedTuple):
 
 def as_inputs(scene: Scene, dtype: str) -> tuple[Inputs, Inputs]:
     """The scene's differentiable inputs, and the places of its textures."""
-    camera, background = as_camera(scene, dtype), jnp.asarray(scene.background, dtype)
+    camera = as_camera(scene, dtype)
+    background = jnp.asarray(scene.background, dtype)
     inputs = as_gaussians(scene, dtype), as_textures(scene, dtype), camera.viewmat, camera.K, background
     return a2tg.partition(Inputs(*inputs))
 
@@ -94,7 +95,8 @@ def oracle_loss(scene: Scene, rules: Rules, name: str, texels: list[Float] | Non
 
     `texels` replace the lookups where given. Only the layers of splats whose own values changed are computed again.
     """
-    weights, base = draw_weights(scene), getattr(scene, name)
+    weights = draw_weights(scene)
+    base = getattr(scene, name)
     layers = oracle.splat_layers(scene, rules, texels)
     largest_alpha = lambda textures: max(texture[..., 3].max() for texture in textures)  # noqa: E731
 
@@ -233,7 +235,8 @@ def test_gradients_do_not_depend_on_tiles_or_on_how_they_are_called():
 @pytest.mark.usefixtures("x64")
 def test_float32_gradients_are_those_of_float64():
     """To 1e-3 of the largest entry: float32 carries about 1e-7 through a few thousand sums and divisions."""
-    scene, settings = smooth_scene(SMOOTH_SEEDS[1], DEFAULT_RULES), a2tg.RenderSettings(compositor="native")
+    scene = smooth_scene(SMOOTH_SEEDS[1], DEFAULT_RULES)
+    settings = a2tg.RenderSettings(compositor="native")
     (_, exact), (_, rounded) = (package_gradient(scene, dtype, settings) for dtype in ("float64", "float32"))
     (exact, _), (rounded, _) = a2tg.partition(exact), a2tg.partition(rounded)
     assert {leaf.dtype for leaf in jax.tree.leaves(rounded)} == {jnp.dtype("float32")}

@@ -46,7 +46,8 @@ def test_a_flight_of_200_views_compiles_three_times_at_most():
 @pytest.mark.parametrize("are_given", [True, False])
 def test_cameras_that_are_known_compile_once(are_given):
     """They are given, or the model was trained with them."""
-    gaussians, cameras = cloud(2100 if are_given else 2200), flight(10, (40, 24))
+    gaussians = cloud(2100 if are_given else 2200)
+    cameras = flight(10, (40, 24))
     model = (
         a2tg.Model(gaussians)
         if are_given
@@ -84,14 +85,16 @@ def test_a_model_with_all_that_belongs_to_it():
         background=background,
         origin=a2tg.Origin.of_cameras([camera]),
     )
-    found, expected = a2tg.Renderer(model)(camera), model.live.render(camera)
+    found = a2tg.Renderer(model)(camera)
+    expected = model.live.render(camera)
     for image, wanted in zip(*map(jax.tree.leaves, (found, expected)), strict=True):
         np.testing.assert_array_equal(image, wanted)
     assert expected.depth.max() > 0
 
 
 def test_what_a_renderer_refuses():
-    camera, textures = flight(1)[0], a2tg.textures_from_arrays(np.ones((300, 1, 1, 4)))
+    camera = flight(1)[0]
+    textures = a2tg.textures_from_arrays(np.ones((300, 1, 1, 4)))
     for call, words in (
         (lambda: a2tg.Renderer(a2tg.Model(cloud()), a2tg.Appearance()), "appearance: a model has its own"),
         (lambda: a2tg.Renderer(cloud(), background=(0, 0, 0, 1)), r"background must be \[3\]; got \[4\]"),
@@ -112,7 +115,8 @@ def test_what_a_renderer_refuses():
 
 def test_gaussians_alone_are_as_opaque_as_the_settings_let_them_be():
     """As `render_image` has it: 0.999 in the authors' conventions, else 0.99."""
-    camera, settings = flight(9)[1], a2tg.RenderSettings.official()
+    camera = flight(9)[1]
+    settings = a2tg.RenderSettings.official()
     gaussians = dataclasses.replace(cloud(), logit_opacities=jnp.full(300, 9.0))
     expected = a2tg.render_image(gaussians, camera, settings=settings)
     assert 1 - expected.alpha.max() < 2e-3

@@ -134,7 +134,8 @@ def some_output(*views: int) -> RenderOutput:
 
 def test_a_checkpoint_whose_buffers_are_reused_says_so():
     checkpoint = some_checkpoint(A2tg(sh_degree=0))
-    model, state = checkpoint.state.model, checkpoint.state
+    model = checkpoint.state.model
+    state = checkpoint.state
     assert repr(checkpoint) == "Checkpoint(A2tg, stage 2, iteration 0, 10 Gaussians)"
     model.num_live.delete()
     state.iteration.delete()

@@ -133,7 +133,8 @@ def assert_same(found, wanted) -> None:
 
 @functools.cache
 def laws() -> dict:
-    model, rows = some_model(), np.array([7, 3, 3, 0])
+    model = some_model()
+    rows = np.array([7, 3, 3, 0])
     repeated = np.resize(rows, NUM)
     system = Own(events="density")
     spare = padded(model, system.stages()[0], system)
@@ -225,7 +226,8 @@ def test_a_file_with_other_shared_numbers_is_refused(tmp_path):
 def test_training_with_events_learns_and_resumes(events, tmp_path):
     """A checkpoint in a file continues to the same bits, moments of what is shared included."""
     scene = a2tg.synthetic_scene(num_views=3, width=24, height=18, num_points=50)
-    system, path = Own(events=events, sh_degree=0), tmp_path / "checkpoint.npz"
+    system = Own(events=events, sh_degree=0)
+    path = tmp_path / "checkpoint.npz"
     kept = []
 
     def save(checkpoint):
@@ -234,7 +236,8 @@ def test_training_with_events_learns_and_resumes(events, tmp_path):
             kept.append(jax.device_get(checkpoint.state.moments))
 
     result = a2tg.fit(scene, system, progress=False, on_checkpoint=save, checkpoint_every=25)
-    history, network = result.history, result.model.appearance.network
+    history = result.history
+    network = result.model.appearance.network
     assert history.loss[-1] < 0.8 * history.loss[0] and (history.num_gaussians != 50).any()
     assert abs(float(network["gain"])) > 1e-3
     resume = a2tg.load_checkpoint(path, Own)
@@ -255,7 +258,8 @@ def test_a_field_learns_at_a_rate_of_its_own():
 def test_gradients_of_a_batch_of_models_and_of_views():
     """`vmap` over models maps what is shared like any array; `value_and_grad` differentiates it."""
     scene = a2tg.synthetic_scene(num_views=3, width=16, height=16, num_points=50)
-    camera, model = scene.train[0].camera, some_model()
+    camera = scene.train[0].camera
+    model = some_model()
     settings = a2tg.plan_render(model, camera, head_room=2)
     brightness = lambda model: jnp.mean(model.render(camera, settings=settings).color)  # noqa: E731
     several = [with_gain(model, gain) for gain in (0.0, 0.4)]
@@ -291,7 +295,8 @@ def test_numbers_get_the_active_degree(degree):
 
 def test_weights_for_pruning_are_those_of_plain_splats():
     """Σ α·T does not depend on the tint."""
-    scene, model = a2tg.synthetic_scene(num_views=3, width=16, height=16, num_points=50), some_model()
+    scene = a2tg.synthetic_scene(num_views=3, width=16, height=16, num_points=50)
+    model = some_model()
     plain = dataclasses.replace(model, appearance=a2tg.Appearance())
     found, wanted = (shown_in(each, scene.train).weights for each in (with_gain(model, -3.0), plain))
     assert wanted.max() > 1

@@ -62,7 +62,8 @@ def test_what_is_constant_shrinks_at_next_to_no_loss():
     model = some_model()
     views = views_of(model)
     small = shrink_textures(model, views, max_loss=0.05, background=BACKGROUND)
-    sizes, found = model.textures.sizes, small.textures.sizes
+    sizes = model.textures.sizes
+    found = small.textures.sizes
     assert (found[2::3] == 0).all() and (found[1::3, 1] == 1).all()  # single texels, and what is constant along u
     assert small.num == model.num and small.num_bytes <= model.num_bytes - 16 * (4 * 12 + 4)
     assert (found <= sizes).all()
@@ -96,7 +97,9 @@ def test_the_cost_predicts_the_change_of_the_picture():
     model = some_model(2)
     cameras = circle(4) * 8  # Many draws of signs.
     step = halve_textures(model, texel_weights(model, cameras, BACKGROUND))
-    before, costs, changes = images_of(model), [], []
+    before = images_of(model)
+    costs = []
+    changes = []
     for index in range(0, NUM, 3):
         is_chosen = np.arange(NUM) == index
         costs.append(step.cost[index] / 8)
@@ -124,7 +127,8 @@ def test_weights_are_the_squared_slopes_of_the_picture():
 @pytest.mark.long
 def test_bands_and_shapes_stay_as_they_are():
     model = some_model()
-    shapes, bands = Exponents(jnp.linspace(-2.0, 2.0, NUM)), Bands().allocate(model.gaussians)
+    shapes = Exponents(jnp.linspace(-2.0, 2.0, NUM))
+    bands = Bands().allocate(model.gaussians)
     appearance = dataclasses.replace(model.appearance, exponents=shapes, bands=bands)
     model = Model(model.gaussians, appearance)
     small = shrink_textures(model, views_of(model), max_loss=0.05, background=BACKGROUND)

@@ -113,7 +113,8 @@ def test_pictures_of_a_folder_that_are_no_files(tmp_path, kind):
 def test_version_1_has_ends_in_place_of_codebooks(tmp_path):
     """As PlayCanvas's first programs wrote it: no version, logits, and one pair of ends for spherical harmonics."""
     wanted = scene()
-    data, described = entries(), {}
+    data = entries()
+    described = {}
 
     def coded(values: np.ndarray) -> tuple[np.ndarray, dict]:
         low, high = values.min(axis=0), values.max(axis=0)
@@ -173,7 +174,8 @@ def test_many_splats_share_sets_of_spherical_harmonics(tmp_path, monkeypatch):
     monkeypatch.setattr(sog, "MOST_ENTRIES", 64)
     monkeypatch.setattr(sog, "LARGEST_GROUP", 200)
     rng = np.random.default_rng(0)
-    kinds, noise = rng.normal(0, 0.3, (40, 15, 3)), 0.01
+    kinds = rng.normal(0, 0.3, (40, 15, 3))
+    noise = 0.01
     rest = kinds[np.arange(600) % 40] + rng.normal(0, noise, (600, 15, 3))
     own = some_gaussians(600)
     sh = jnp.asarray(np.concatenate([np.asarray(own.sh)[:, :1], rest], axis=1), jnp.float32)
@@ -258,7 +260,8 @@ def claiming(**sizes: int) -> bytes:
 def of_pictures() -> dict[str, tuple[bytes, str]]:
     found = {}
     for name in PICTURES:
-        data, pixels = entries()[name], pixels_of(entries()[name])
+        data = entries()[name]
+        pixels = pixels_of(entries()[name])
         kind = name.removesuffix(".webp")
         found |= {
             f"no {kind}": (without(name), f"lacks the picture {name}"),

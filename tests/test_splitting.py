@@ -163,7 +163,9 @@ def test_the_last_event_leaves_the_cap():
     counts = []
     for num_left, iteration in ((4, 10), (3, 20), (2, 30), (1, 40)):
         change = event.apply(some_now(iteration, 50, num_left, num_keys=2), model, moments, statistics)
-        model, moments, statistics = change.model, change.moments, change.state
+        model = change.model
+        moments = change.moments
+        statistics = change.state
         counts.append(int(model.num_live))
     assert counts == sorted(counts) and counts[-1] == 390 and counts[0] > LIVE
 
@@ -176,7 +178,8 @@ def test_few_outlying_points_do_not_take_all_new_gaussians():
     """
     clean = a2tg.synthetic_scene(num_points=5_000, downscale=4)
     rng = np.random.default_rng(0)
-    points, outlying = clean.points.copy(), rng.choice(len(clean.points), 10, replace=False)
+    points = clean.points.copy()
+    outlying = rng.choice(len(clean.points), 10, replace=False)
     points[outlying] = rng.uniform(-1, 1, (10, 3))
     system = dataclasses.replace(
         a2tg.Bytewise.preset("quick"),

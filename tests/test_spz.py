@@ -25,7 +25,8 @@ SAFE_ORBIT = struct.pack("<IIfff", 0xADBE0002, 12, -0.5, 0.5, 1.0)
 
 def with_records(*records: bytes) -> bytes:
     """The file of splat-transform, of version 4, with records of extensions."""
-    head, rest = bytearray(SCENE[:32]), SCENE[32:]
+    head = bytearray(SCENE[:32])
+    rest = SCENE[32:]
     head[14] |= 2
     struct.pack_into("<I", head, 16, 32 + len(b"".join(records)))
     return bytes(head) + b"".join(records) + rest

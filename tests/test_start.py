@@ -47,7 +47,9 @@ def test_splats_of_a_pixel_stay_bit_for_bit():
 
 def test_the_camera_that_sees_a_splat_largest_decides():
     given = splats([0.5, 0.5], 0.5)
-    near, far, behind = camera_at(DEPTH / 2), camera_at(4 * DEPTH), camera_at(-DEPTH, 10 * FOCAL)
+    near = camera_at(DEPTH / 2)
+    far = camera_at(4 * DEPTH)
+    behind = camera_at(-DEPTH, 10 * FOCAL)
     np.testing.assert_array_equal(fainter_where_dense(given, [far, near]).logit_opacities, given.logit_opacities)
     one = fainter_where_dense(given, [far]).opacities
     np.testing.assert_array_equal(fainter_where_dense(given, [far, behind]).opacities, one)
@@ -80,7 +82,8 @@ def test_splats_without_a_filter_begin_a_pixel_wide():
 def test_billboards_begin_wide_and_opaque():
     scene = a2tg.synthetic_scene(num_views=4, width=24, height=16, num_points=900)
     system = a2tg.BBSplat.preset("smoke")
-    model, plain = initial_model(scene, system), initial_model(scene, a2tg.Gaussians2d.preset("smoke"))
+    model = initial_model(scene, system)
+    plain = initial_model(scene, a2tg.Gaussians2d.preset("smoke"))
     assert (model.gaussians.log_scales > plain.gaussians.log_scales[: model.num]).any()
     np.testing.assert_allclose(model.gaussians.opacities, system.initial_opacity, rtol=1e-5)
 

@@ -37,7 +37,8 @@ def add(ids, starts, part, images, splats, texels, probe, places=None, *more):
     """What a thread does, in numpy: with the extra rows that the loop is given, or without places in its own copy."""
     for position in range(starts[part[0]], starts[part[1]]):
         numbers = np.random.default_rng(position).normal(size=5).astype(np.float32)
-        splat, place = ids[position], -1 if places is None else places[position]
+        splat = ids[position]
+        place = -1 if places is None else places[position]
         row, own = (splat, (splats, texels, probe)) if place < 0 else (place, more)
         own[0][row] += numbers
         if len(probe) == NUM:

@@ -69,7 +69,8 @@ def assert_same(a, b):
 
 def check_run(scene, system, folder, every: int = 8):
     """Train a system, resume it from the file of its second checkpoint, and write and read its model."""
-    path, num_saved = folder / "checkpoint.npz", 0
+    path = folder / "checkpoint.npz"
+    num_saved = 0
 
     def keep(checkpoint):
         nonlocal num_saved
@@ -82,7 +83,8 @@ def check_run(scene, system, folder, every: int = 8):
     assert resume.iteration == 2 * every
     assert_same(a2tg.fit(scene, system, resume=resume, progress=False).model, result.model)
     a2tg.save_model(folder / "model.npz", result.model)
-    loaded, view = a2tg.load_model(folder / "model.npz"), scene.test[0]
+    loaded = a2tg.load_model(folder / "model.npz")
+    view = scene.test[0]
     assert_same(loaded, result.model)
     np.testing.assert_array_equal(loaded.render(view.camera).color, result.model.render(view.camera).color)
     assert result.history.megabytes[-1] == pytest.approx(loaded.num_bytes / 1e6)
@@ -107,7 +109,8 @@ def test_every_system_trains_resumes_saves_and_renders(scene, tmp_path, name):
 def test_training_keeps_the_dtype_of_its_model(scene, tmp_path, name):
     """Also from a checkpoint; nothing falls back to float32, or to float64 where the model is float32."""
     system = tiny(name)
-    first, index = initial_model(scene, system), len(system.stages()) - 1
+    first = initial_model(scene, system)
+    index = len(system.stages()) - 1
     for dtype in (jnp.float64, jnp.float32):
         run = StageRun(scene, system, index, jax.tree.map(lambda x: x.astype(dtype), first))  # noqa: B023
         assert len(run.steps(1, 1)) == 1
@@ -134,7 +137,8 @@ def test_a_toy_of_one_file_does_all_that_the_others_do(scene, tmp_path):
 @pytest.mark.filterwarnings("ignore:stage 'textures'. texture changed nothing")  # Of a share of 0.
 def test_textures_of_one_texel_that_do_not_learn_change_nothing(scene):
     """They stay (0, 0, 0, 1), and the Gaussians are those of a stage without textures."""
-    plain, textured = tiny("gaussians-2d-mcmc"), tiny("a2tg", texture={"fraction": 0.0}, single_texel_rate=0.0)
+    plain = tiny("gaussians-2d-mcmc")
+    textured = tiny("a2tg", texture={"fraction": 0.0}, single_texel_rate=0.0)
     first = fit_stage(scene, plain, 0, progress=False).model
     expected, found = (fit_stage(scene, one, 1, first, progress=False).model for one in (plain, textured))
     (texels,) = found.textures.buckets
@@ -171,7 +175,8 @@ def test_textures_may_begin_empty_and_kernels_have_shapes(scene, tmp_path, more)
 
 
 def test_textured_gaussians_are_a2tg_with_one_size_and_no_events():
-    fixed, other = tiny("textured-gaussians", texture_side=2), tiny("a2tg")
+    fixed = tiny("textured-gaussians", texture_side=2)
+    other = tiny("a2tg")
     first, second = other.stages()
     appearance = dataclasses.replace(
         second.appearance, texture=dataclasses.replace(second.appearance.texture, start=(2, 2))
@@ -199,7 +204,8 @@ def test_official_is_a_preset_of_all_options():
     found = dataclasses.asdict(official.texture)
     wanted = {"select": "threshold", "threshold": 2e-5, "axes": "authors", "gradient": "screen"}
     assert {name: found[name] for name in wanted} == wanted
-    lookup, defaults = dataclasses.asdict(official.lookup), dataclasses.asdict(a2tg.TextureOptions())
+    lookup = dataclasses.asdict(official.lookup)
+    defaults = dataclasses.asdict(a2tg.TextureOptions())
     same = [name for name in defaults if lookup[name] == defaults[name]]
     assert same == ["extent"], "each other choice differs from the paper's"
     assert official.noise_in_stage2 and official.stages()[0].appearance.max_alpha == 0.999
@@ -223,7 +229,8 @@ def test_the_host_waits_once_for_many_steps(scene, monkeypatch):
 
 def test_photographs_stay_on_the_device_while_they_fit(scene):
     order = BatchOrder(scene.train, 2, 0)
-    everything, nothing = PhotoStore(scene.train, order, 9), PhotoStore(scene.train, order, 9, room=0)
+    everything = PhotoStore(scene.train, order, 9)
+    nothing = PhotoStore(scene.train, order, 9, room=0)
     assert everything.is_resident and not nothing.is_resident
     for iteration in (1, 4, 2, 9):
         batches = [store.batch(iteration) for store in (everything, nothing)]
@@ -355,7 +362,8 @@ def test_like_takes_options_of_the_same_name_and_type():
     assert other.stages()[0] == main.stages()[0]
     fields = [("densify", int, 3), ("sh_degree", str, "two")]
     kind = dataclasses.make_dataclass("Other", fields, bases=(Toy,), frozen=True)
-    like, back = a2tg.like(kind, a2tg.A2tg(seed=7)), a2tg.like(a2tg.A2tg, kind(seed=7))
+    like = a2tg.like(kind, a2tg.A2tg(seed=7))
+    back = a2tg.like(a2tg.A2tg, kind(seed=7))
     assert (like.seed, like.densify, like.sh_degree) == (7, 3, "two")
     assert (back.seed, back.densify, back.sh_degree) == (7, a2tg.A2tg().densify, 3)
 
@@ -391,7 +399,9 @@ VARIANTS = [
 def test_a_sweep_compiles_each_step_once(scene, name, event, thresholds):
     """In a process that has compiled nothing yet: it comes last in this file, since it drops what others compiled. A
     traced weight is the weight: large scales cost more."""
-    session, counts, scales = a2tg.Session(), [], []
+    session = a2tg.Session()
+    counts = []
+    scales = []
     jitted_step().clear_cache()
     fixed: dict = {"loss": {"scale_weight": 0.01}}
     if name == "a2tg":

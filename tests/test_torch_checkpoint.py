@@ -122,7 +122,8 @@ def test_pytorch_opens_what_is_written(tmp_path):
         ("b.pt", Model(of_degree(0))),
     ):
         save_splats(tmp_path / name, model)
-        found, wanted = torch.load(tmp_path / name, weights_only=True), unpickled(tmp_path / name)
+        found = torch.load(tmp_path / name, weights_only=True)
+        wanted = unpickled(tmp_path / name)
         key = "pipeline" if name == "a.ckpt" else "splats"
         for own, array in wanted[key].items():
             np.testing.assert_array_equal(found[key][own].numpy(), array)

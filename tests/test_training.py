@@ -104,7 +104,8 @@ def test_a_second_or_resumed_run_is_the_same(scene, trained, tmp_path, place):
 @pytest.mark.long
 def test_what_ran_before_in_the_process_changes_nothing(scene, trained):
     """Runs in between leave larger tile lists, other buckets of textures, other programs, another seed's orders."""
-    before, texture = trained[0], Upscale(at=(0.5,), cap=8, fraction=0.9)
+    before = trained[0]
+    texture = Upscale(at=(0.5,), cap=8, fraction=0.9)
     other = fit(scene, dataclasses.replace(CONFIG, densify=Mcmc(cap=150), texture=texture, seed=4), progress=False)
     fit(scene, Gaussians2d(stage1_iterations=20, densify=CloneSplitPrune(cap=200), batch_size=2), progress=False)
     again = fit(scene, CONFIG, progress=False)
@@ -117,7 +118,8 @@ def test_what_ran_before_in_the_process_changes_nothing(scene, trained):
 @pytest.mark.long
 @pytest.mark.parametrize(("calls", "stage"), [(17, 0), (40, 1)])
 def test_a_stop_between_any_two_steps_changes_nothing(scene, trained, tmp_path, calls, stage):
-    left, kept = iter(range(calls)), []
+    left = iter(range(calls))
+    kept = []
 
     def keep(checkpoint):
         kept.append((checkpoint.stage, checkpoint.iteration))
@@ -128,7 +130,8 @@ def test_a_stop_between_any_two_steps_changes_nothing(scene, trained, tmp_path, 
         is_stopped = lambda: next(left, None) is None  # noqa: E731
         fit(scene, CONFIG, on_checkpoint=keep, on_log=rows.append, progress=False, is_stopped=is_stopped)
     assert kept[-1][0] == stage and 0 < kept[-1][1] < 20 and kept[-1][1] % 10
-    saved, history = load_checkpoint(tmp_path / "checkpoint.npz"), stopped.value.checkpoint.history.to_dict()
+    saved = load_checkpoint(tmp_path / "checkpoint.npz")
+    history = stopped.value.checkpoint.history.to_dict()
     jax.tree.map(np.testing.assert_array_equal, stopped.value.checkpoint.model, saved.model)
     last = [row for row in rows if row["stage"] == stage + 1]
     assert {name: [row[name] for row in last] for name in history} == jax.tree.map(list, history)
@@ -142,10 +145,12 @@ def test_shapes_of_earlier_runs_change_nothing(scene, tmp_path, request):
         return
     start = initial_model(scene, CONFIG)
     whole = fit_stage(scene, CONFIG, 1, start, progress=False)
-    textures, session = whole.model.textures, Session()
+    textures = whole.model.textures
+    session = Session()
     capacities = (*(len(bucket) + 2 for bucket in textures.buckets), 1)
     session.shapes.add(Shape((*textures.bucket_sizes, (5, 5)), capacities))
-    path, rooms = tmp_path / "checkpoint.npz", []
+    path = tmp_path / "checkpoint.npz"
+    rooms = []
 
     def keep(checkpoint):
         if checkpoint.iteration == 16:
@@ -193,7 +198,8 @@ def test_rows_that_do_not_exist_are_not_trained(scene, trained):
 
 
 def test_rows_are_not_added_to_textures_of_another_size(trained):
-    start, template = trained[0].stages[0].model, Appearance(texture=Texture(start=(2, 2)))
+    start = trained[0].stages[0].model
+    template = Appearance(texture=Texture(start=(2, 2)))
     single = allocate_appearance(Appearance(texture=Texture()), jax.random.key(0), start.gaussians).textures
     appearance = template.with_textures(single)
     stage = Stage("more", template, (Mcmc(500),), (), CONFIG.rates, 3_000)

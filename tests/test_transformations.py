@@ -73,7 +73,8 @@ def test_first_derivatives_come_through(way):
 
 def test_donated_buffers():
     step = lambda g: jax.tree.map(lambda x, d: x - 1e-3 * d, g, jax.grad(loss)(g))  # noqa: E731
-    wanted, found = jax.jit(step)(some_gaussians()), jax.jit(step, donate_argnums=0)(some_gaussians())
+    wanted = jax.jit(step)(some_gaussians())
+    found = jax.jit(step, donate_argnums=0)(some_gaussians())
     jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-6), found, wanted)
 
 
@@ -209,7 +210,8 @@ def dot(a, b):
 @pytest.mark.usefixtures("x64")
 def test_autodiff_shows_what_the_oracle_shows():
     scene = draw_scene(4, num=12, width=19, height=13)
-    found, wanted = render_scene(scene, "float64", RenderSettings(compositor="autodiff")), oracle.render(scene)
+    found = render_scene(scene, "float64", RenderSettings(compositor="autodiff"))
+    wanted = oracle.render(scene)
     for field in ("color", "alpha", "depth", "normal"):
         np.testing.assert_allclose(getattr(found, field), getattr(wanted, field), atol=1e-9)
 
@@ -219,9 +221,11 @@ def test_autodiff_shows_what_the_oracle_shows():
 def test_derivatives_of_autodiff_are_those_of_differences():
     """First derivatives in both modes and second ones, forward over reverse, along one direction of Gaussians and
     texels, of a loss of all that a textured scene shows."""
-    gaussians, camera = as_gaussians(SMOOTH, "float64"), as_camera(SMOOTH, "float64")
+    gaussians = as_gaussians(SMOOTH, "float64")
+    camera = as_camera(SMOOTH, "float64")
     parameters, places = partition((gaussians, as_textures(SMOOTH, "float64")))
-    settings, rng = RenderSettings(capacity=1024, compositor="autodiff"), np.random.default_rng(0)
+    settings = RenderSettings(capacity=1024, compositor="autodiff")
+    rng = np.random.default_rng(0)
     weights = jnp.asarray(rng.normal(size=(8, 8, 9)))
     direction = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), parameters)
 
@@ -233,7 +237,8 @@ def test_derivatives_of_autodiff_are_those_of_differences():
         return jnp.sum(weights * images + images**2)
 
     value, slope = jax.jit(lambda d: jax.jvp(loss, (parameters,), (d,)))(direction)
-    differentiate, step = jax.jit(jax.value_and_grad(loss)), 3e-6
+    differentiate = jax.jit(jax.value_and_grad(loss))
+    step = 3e-6
     here, gradient = differentiate(parameters)
     np.testing.assert_allclose([value, slope], [here, dot(gradient, direction)], rtol=1e-9)
     (more, ahead), (less, behind) = (differentiate(moved(parameters, direction, by)) for by in (step, -step))
@@ -245,7 +250,8 @@ def test_derivatives_of_autodiff_are_those_of_differences():
 @pytest.mark.long
 @pytest.mark.usefixtures("x64")
 def test_gradient_of_a_gradient():
-    camera, gaussians = as_camera(SCENE, "float64"), as_gaussians(SCENE, "float64")
+    camera = as_camera(SCENE, "float64")
+    gaussians = as_gaussians(SCENE, "float64")
     parameters = dataclasses.replace(gaussians, sh=gaussians.sh[:, :1])
     direction = jax.tree.map(jnp.sin, parameters)
 
@@ -254,7 +260,8 @@ def test_gradient_of_a_gradient():
         return jnp.sum(render_image(gaussians, camera, settings=settings).color ** 2)
 
     found = jax.jit(jax.grad(lambda x: dot(jax.grad(loss)(x), direction)))(parameters)
-    gradient_of, step = jax.jit(jax.grad(loss)), 3e-6
+    gradient_of = jax.jit(jax.grad(loss))
+    step = 3e-6
     ahead, behind = (gradient_of(moved(parameters, direction, by)) for by in (step, -step))
     assert_differences(found, ahead, behind, step)
 
@@ -264,7 +271,8 @@ def test_gradient_of_a_gradient():
 def test_autodiff_has_the_gradient_of_the_other_compositors():
     """On a scene with opaque, edge-on and invisible splats, in tiles with several blocks."""
     scene = draw_scene(6, num=20, width=12, height=9)
-    camera, background = as_camera(scene, "float64"), jnp.asarray(scene.background)
+    camera = as_camera(scene, "float64")
+    background = jnp.asarray(scene.background)
 
     def gradient(compositor):
         settings = RenderSettings(capacity=1024, compositor=compositor)

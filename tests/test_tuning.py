@@ -97,7 +97,9 @@ def test_groups_kept_as_floats_are_not_rounded(precision):
 def test_numbers_are_rounded_one_after_the_other_and_stay():
     start = half_turned(MODELS["banded, shaped and textured"]())
     rounding = GridRounding.to(grids_of(start, COARSE), COARSE)
-    times, wanted, jitted = GradualRounding(rounding).init(start), round_to(rounding, start), jax.jit(partly_rounded)
+    times = GradualRounding(rounding).init(start)
+    wanted = round_to(rounding, start)
+    jitted = jax.jit(partly_rounded)
     before = np.zeros(0, int)
     for share in (0.0, 0.3, 0.6, 1.0):
         found = jitted(rounding, moved(start, 1e-4), jax.tree.map(lambda time, share=share: time < share, times))
@@ -126,7 +128,8 @@ def test_tuning_makes_up_for_rounding():
     """It ends above the same training whose result is rounded afterwards, and below the one without rounding."""
     fine = tuned_model(FINE).model
     loss = loss_on_views(fine, SCENE.train)
-    lost, untuned = loss(tuned_model().model), loss(model_in(compact_bytes(fine, COARSE)))
+    lost = loss(tuned_model().model)
+    untuned = loss(model_in(compact_bytes(fine, COARSE)))
     assert untuned > 1 and 0 < lost < 0.8 * untuned
     assert tuned_model().model.origin == fine.origin == a_model().origin
 
@@ -193,7 +196,8 @@ def misplaced(view, exposure, twist):
 def corrected() -> tuple[Scene, Model]:
     """A scene of misplaced views, and a model that has learned how they are."""
     views = tuple(map(misplaced, SCENE.train, EXPOSURES, TWISTS))
-    origin, num_test = origin_of(SCENE), len(SCENE.test)
+    origin = origin_of(SCENE)
+    num_test = len(SCENE.test)
     learned = {
         "exposure": np.concatenate([EXPOSURES, np.tile(np.eye(3, 4), (num_test, 1, 1))]),
         "pose": np.concatenate([TWISTS, np.zeros((num_test, 6))]),
@@ -229,7 +233,8 @@ def test_a_model_without_what_was_learned_of_the_photographs_is_refused():
 
 @pytest.mark.long
 def test_corrections_keep_their_rows(monkeypatch):
-    found, fit_stage = [], tuning.fit_stage
+    found = []
+    fit_stage = tuning.fit_stage
     monkeypatch.setattr(tuning, "fit_stage", lambda *a, **options: found.append(fit_stage(*a, **options)) or found[0])
     scene, model = corrected()
     tune_compact(model, scene, CORRECTED, FINE, iterations=5)
@@ -253,7 +258,8 @@ def test_corrections_keep_their_rows(monkeypatch):
 )
 def test_the_search(monkeypatch, losses, max_loss, tolerances, kept):
     """Its tolerances before tuning, the file it keeps, and the models it starts from, given losses after tuning."""
-    tried, started = [], []
+    tried = []
+    started = []
 
     def within(model, measures, tolerance, trials):
         tried.append(tolerance)
@@ -280,7 +286,11 @@ def test_the_search(monkeypatch, losses, max_loss, tolerances, kept):
 
 
 def test_the_search_ends_without_choices_and_at_the_coarsest(monkeypatch):
-    choices, tune = CompactChoices(), lambda *_: Tuned("tuned", CompactChoices(), {})
+    choices = CompactChoices()
+
+    def tune(*_):
+        return Tuned("tuned", choices, {})
+
     assert smallest_tuned(a_model(), [lambda _: 1.0], 0.05, [], tune) == TunedFiles([])
     monkeypatch.setattr(tuning, "smallest_within", lambda *a: Trial(choices, 0, (0.0,)))
     monkeypatch.setattr(tuning, "_measured", lambda *a: Trial(choices, 7, (0.0,)))
@@ -301,7 +311,8 @@ def test_the_search_ends_without_choices_and_at_the_coarsest(monkeypatch):
 )
 def test_the_search_for_a_file_of_given_bytes(monkeypatch, growth, targets, kept):
     """Bytes before tuning, and the file it keeps, given by how much files grow in tuning."""
-    asked, started = [], []
+    asked = []
+    started = []
 
     def within(model, max_bytes, trials):
         assert model == "model"

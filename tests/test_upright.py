@@ -20,7 +20,8 @@ FILE_UP = np.array([0.0, -1.0, 0.0])
 
 def captured(to_original: Similarity, num: int = 12) -> a2tg.Model:
     """A model whose cameras look down at it, in a world with +z up; `to_original` leads from there."""
-    cameras, K = [], jnp.asarray([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
+    cameras = []
+    K = jnp.asarray([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
     for angle in np.linspace(0, 2 * np.pi, num, endpoint=False):
         outward = np.array([np.cos(angle), np.sin(angle), 0.5 + 0.3 * np.sin(3 * angle)])
         viewmat = a2tg.look_at(4 * outward, np.zeros(3), width=64, height=48).viewmat
@@ -44,7 +45,8 @@ def test_axes_of_a_known_vertical_only_change_their_names(up):
 
 def test_pictures_of_an_upright_file_are_the_same(tmp_path):
     """Of degree 3, in a capture that is tilted; cameras are carried along, and the file knows the way back."""
-    model, settings = captured(some_world()), a2tg.RenderSettings()
+    model = captured(some_world())
+    settings = a2tg.RenderSettings()
     a2tg.save_ply(tmp_path / "a.ply", model, world="upright")
     found = a2tg.load_splats(tmp_path / "a.ply")
     to_file = model.origin.transform.inverse().then(found.origin.transform)

@@ -22,7 +22,8 @@ SUFFIXES = (".usda", ".usdc", ".usdz", ".usd")
 @pytest.mark.parametrize("suffix", SUFFIXES)
 @pytest.mark.parametrize("name", ["plain 4", "textured", "banded 0"])
 def test_models_come_back(tmp_path, name, suffix):
-    model, path = MODELS[name](), tmp_path / f"a b{suffix}"
+    model = MODELS[name]()
+    path = tmp_path / f"a b{suffix}"
     model = dataclasses.replace(model, origin=dataclasses.replace(model.origin, transform=some_world()))
     save_usd(path, model)
     found = load_usd(path)
@@ -40,7 +41,8 @@ def test_a_background_without_cameras_comes_back(tmp_path):
 
 @pytest.mark.parametrize("ellipsoids", [False, True])
 def test_the_stage_is_as_the_schema_says(tmp_path, ellipsoids):
-    path, model = tmp_path / "m.usdc", plain(9)
+    path = tmp_path / "m.usdc"
+    model = plain(9)
     model = dataclasses.replace(model, origin=dataclasses.replace(model.origin, transform=some_world()))
     save_usd(path, model, ellipsoids=ellipsoids)
     stage = Usd.Stage.Open(str(path))
@@ -83,7 +85,8 @@ def stage_of(gaussians, kernel=UsdVol.ParticleFieldKernelGaussianSurfletAPI, up=
 
 
 def test_fields_of_other_programs(tmp_path):
-    gaussians, path = some_gaussians(), str(tmp_path / "m.usda")
+    gaussians = some_gaussians()
+    path = str(tmp_path / "m.usda")
     stage, field = stage_of(gaussians)
     field.AddTranslateOp().Set(Gf.Vec3d(100, 0, 0))
     stage.GetRootLayer().Export(path)
@@ -140,7 +143,8 @@ def test_a_degree_without_coefficients_takes_no_memory(tmp_path):
 
 
 def test_degree_4_is_read_to_degree_3(tmp_path):
-    path, gaussians = tmp_path / "m.usda", some_gaussians()
+    path = tmp_path / "m.usda"
+    gaussians = some_gaussians()
     sh = np.random.default_rng(0).normal(size=(gaussians.num, 25, 3)).astype(np.float32)
     stage, field = stage_of(gaussians)
     harmonics = UsdVol.ParticleFieldSphericalHarmonicsAttributeAPI(field)

@@ -44,9 +44,15 @@ def encode(path, frames, *, codec="mpeg4", still=None, aspect=1):
     with av.open(f"file:{path}", "w") as container:
         if still is not None:
             cover = container.add_stream("mjpeg", rate=1)
-            cover.width, cover.height, cover.pix_fmt, cover.disposition = 640, 480, "yuvj420p", still
+            cover.width = 640
+            cover.height = 480
+            cover.pix_fmt = "yuvj420p"
+            cover.disposition = still
         stream = container.add_stream(codec, rate=25)
-        stream.width, stream.height, stream.pix_fmt, stream.bit_rate = WIDTH, HEIGHT, "yuv420p", 4_000_000
+        stream.width = WIDTH
+        stream.height = HEIGHT
+        stream.pix_fmt = "yuv420p"
+        stream.bit_rate = 4_000_000
         stream.codec_context.sample_aspect_ratio = Fraction(aspect)
         if still is not None:
             black = av.VideoFrame.from_ndarray(np.zeros((480, 640, 3), np.uint8), format="rgb24")
@@ -99,7 +105,8 @@ def test_frames_are_turned_and_mirrored_as_players_show_them(tmp_path, matrix):
     height, width = pixels.shape
     assert (width, height) == ((WIDTH, HEIGHT) if a else (HEIGHT, WIDTH))
     for (x, y), grey in QUADRANTS.items():
-        right, down = a * x + c * y, b * x + d * y
+        right = a * x + c * y
+        down = b * x + d * y
         assert abs(int(pixels[height * (2 + down) // 4, width * (2 + right) // 4]) - grey) < 8
 
 
@@ -156,7 +163,9 @@ def test_of_several_videos_the_largest_is_read_with_a_warning(tmp_path):
     with av.open(str(tmp_path / "clip.mp4"), "w") as container:
         streams = [container.add_stream("mpeg4", rate=25) for _ in range(3)]
         for stream, side in zip(streams, (32, 64, 48), strict=True):
-            stream.width, stream.height, stream.pix_fmt = side, side, "yuv420p"
+            stream.width = side
+            stream.height = side
+            stream.pix_fmt = "yuv420p"
         for stream in streams * 12:
             pixels = np.zeros((stream.height, stream.width, 3), np.uint8)
             container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
@@ -171,7 +180,9 @@ def test_an_interlaced_video_is_read_with_advice(tmp_path):
     av = pytest.importorskip("av", reason="the extra [video] is not installed")
     with av.open(str(tmp_path / "0001.mts"), "w", format="mpegts") as container:
         stream = container.add_stream("mpeg2video", rate=25, options={"flags": "+ildct+ilme"})
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        stream.width = WIDTH
+        stream.height = HEIGHT
+        stream.pix_fmt = "yuv420p"
         for grey in np.random.default_rng(0).integers(0, 255, (5, HEIGHT, WIDTH, 1)):
             frame = av.VideoFrame.from_ndarray(np.repeat(grey.astype(np.uint8), 3, -1), format="rgb24")
             container.mux(stream.encode(frame))

@@ -59,7 +59,8 @@ def cut(sh: np.ndarray, degrees: np.ndarray) -> np.ndarray:
 
 def banded(seed: int, base: int = 0, dtype: str = "float32", template: Appearance = Appearance()):  # noqa: B008 - frozen
     """A model of a random degree per Gaussian, and the same of degree 3 with zeros."""
-    scene, degrees = draw_scene(seed, num=NUM), random_degrees(seed, base)
+    scene = draw_scene(seed, num=NUM)
+    degrees = random_degrees(seed, base)
     full = as_gaussians(scene, dtype)
     full = dataclasses.replace(full, sh=jnp.asarray(cut(np.asarray(full.sh), degrees), full.means.dtype))
     gaussians = dataclasses.replace(full, sh=full.sh[:, : (base + 1) ** 2])
@@ -97,7 +98,8 @@ def test_gradients_are_those_of_the_dense_coefficients():
         loss = lambda floats: jnp.sum(weights * combine(floats, rest).render(camera, settings=settings).color)  # noqa: E731
         return combine(jax.grad(loss)(floats), rest)
 
-    found, expected = gradient(model), gradient(plain)
+    found = gradient(model)
+    expected = gradient(plain)
     wanted = cut(np.asarray(expected.gaussians.sh), model.degrees)
     np.testing.assert_allclose(found.sh, wanted[:, : found.sh.shape[1]], atol=1e-12)
     np.testing.assert_allclose(found.gaussians.means, expected.gaussians.means, atol=1e-10)
@@ -142,7 +144,8 @@ def test_a_ply_file_and_another_world_have_all_coefficients(tmp_path):
 
 
 def test_rows_move_while_all_have_one_degree():
-    gaussians, rows = as_gaussians(draw_scene(0, num=NUM), "float32"), np.random.default_rng(10).integers(0, NUM, NUM)
+    gaussians = as_gaussians(draw_scene(0, num=NUM), "float32")
+    rows = np.random.default_rng(10).integers(0, NUM, NUM)
     low = Model(dataclasses.replace(gaussians, sh=gaussians.sh[:, :1]))
     one_degree = with_bands(low, gaussians.sh[:, 1:], np.full(NUM, 3))
     np.testing.assert_array_equal(one_degree[rows].sh, gaussians.sh[rows])
@@ -168,7 +171,8 @@ def test_other_degrees_keep_what_a_gaussian_keeps(seed):
 def test_the_gradient_of_missing_coefficients_is_that_of_coefficients_that_are_zero():
     """Σ over views of ∂L/∂colour · Y is what JAX finds at zeros."""
     rng = np.random.default_rng(0)
-    means, centers = rng.normal(size=(NUM, 3)), rng.normal(size=(6, 3)) + 5
+    means = rng.normal(size=(NUM, 3))
+    centers = rng.normal(size=(6, 3)) + 5
     colors = rng.normal(size=(6, NUM, 3)).astype(np.float32)
     as_array = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
     state = ViewDependence.init(NUM).observe(as_array(means), as_array(centers), as_array(colors))
@@ -194,7 +198,8 @@ def test_degrees_rise_where_the_gradient_per_byte_is_largest():
 
 
 def test_idle_bands_are_given_up():
-    degrees, dense = np.array([0, 1, 1, 2]), np.zeros((4, 15, 3), np.float32)
+    degrees = np.array([0, 1, 1, 2])
+    dense = np.zeros((4, 15, 3), np.float32)
     dense[2, :3] = dense[3, :3] = 1.0
     gaussians = some_gaussians(4)
     bands = with_bands(Model(dataclasses.replace(gaussians, sh=gaussians.sh[:, :1])), dense, degrees)
@@ -270,6 +275,7 @@ def test_degrees_rise_in_banded_models_only_and_no_gaussians_are_added_then():
     stage = Stage("more", rule_of(model.appearance), (Mcmc(2 * NUM),), (), LearningRates(), 100, 0.0)
     with pytest.raises(ValueError, match="textures or degrees have grown already"):
         padded(model, stage, Gaussians2dMcmc())
-    model, event = Model(as_gaussians(draw_scene(1, num=NUM), "float32")), AdaptDegrees(1.0)
+    model = Model(as_gaussians(draw_scene(1, num=NUM), "float32"))
+    event = AdaptDegrees(1.0)
     with pytest.raises(ValueError, match=r"^plain Gaussians cannot raise degrees: the stage needs Appearance\(bands="):
         event.apply(Due(), model, adam_init(partition(model)[0]), event.init(model))

@@ -376,7 +376,8 @@ def test_a_model_that_knows_no_scene_has_no_photographs():
 def test_a_folder_and_a_single_file(tmp_path):
     scene = synthetic_scene(num_views=4, width=24, height=16, num_points=20)
     source = Source(dataclasses.replace(textured(), origin=origin_of(scene)), "a")
-    text, page = export_web(source, tmp_path / "site"), tmp_path / "site" / "index.html"
+    text = export_web(source, tmp_path / "site")
+    page = tmp_path / "site" / "index.html"
     assert page.read_text(encoding="utf-8") == viewer_html(is_exported=True) != viewer_html()
     scene = (tmp_path / "site" / "scene.a2tgz").read_bytes()
     assert f"whose scene takes {in_bytes(len(scene))}, " in text and "dB of PSNR lost, for a model of 30 dB" in text
@@ -433,7 +434,8 @@ def test_a_page_compares_two_models_of_one_scene(tmp_path):
 
 
 def test_a_failed_export_leaves_the_photographs_of_the_old_page(tmp_path, monkeypatch):
-    source, old = Source(textured(), "a"), tmp_path / "photographs" / "0.jpg"
+    source = Source(textured(), "a")
+    old = tmp_path / "photographs" / "0.jpg"
     export_web(source, tmp_path)
     old.parent.mkdir()
     old.touch()
@@ -478,7 +480,8 @@ def test_photographs_that_cannot_be_read_are_not_called_missing(tmp_path, monkey
     def fail(self):
         raise error
 
-    run, scene = create_run(tmp_path / "run"), synthetic_scene(num_views=4, width=24, height=16, num_points=20)
+    run = create_run(tmp_path / "run")
+    scene = synthetic_scene(num_views=4, width=24, height=16, num_points=20)
     write_record(run, RunRecord(SceneSource("synthetic"), "a2tg", A2tg()))
     save_model(run.model("a2tg-textures"), dataclasses.replace(textured(), origin=origin_of(scene)))
     monkeypatch.setattr(SceneSource, "load", fail)

@@ -125,7 +125,8 @@ def test_the_page_shows_a_real_scene(node, shared, tmp_path):
 def test_the_page_itself(node, tmp_path):
     """An edit that it saves shows in Python what the page shows."""
     run_node("test:browser", "--", "page", "adjust", A2TG_EDIT=str(tmp_path))
-    edit, model = a2tg.load_edit(tmp_path / "edit.json"), small_model()
+    edit = a2tg.load_edit(tmp_path / "edit.json")
+    model = small_model()
     box = crop_box(model, edit.up, np.zeros(3), np.array([1, 1, 0.55]))
     for found, wanted in ((edit.crop.axes, box.axes), (edit.crop.low, box.low), (edit.crop.high, box.high)):
         np.testing.assert_allclose(found, wanted, atol=1e-6)

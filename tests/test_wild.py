@@ -45,7 +45,8 @@ def trained(scene):
     """A training with all of it: one view has a depth map, and 20 points hang before a camera."""
     camera = scene.train[0].camera
     near = np.asarray(camera.center + 0.1 * camera.viewmat[2, :3])[None] + 0.01 * RNG.normal(size=(20, 3))
-    points, colors = np.concatenate([near, scene.points]), np.concatenate([np.ones((20, 3)), scene.colors])
+    points = np.concatenate([near, scene.points])
+    colors = np.concatenate([np.ones((20, 3)), scene.colors])
     first = dataclasses.replace(scene.train[0], depth=RNG.uniform(0.5, 1, (30, 40)).astype(np.float32))
     found = dataclasses.replace(
         scene, train=(first, *scene.train[1:]), points=points.astype(np.float32), colors=colors.astype(np.float32)
@@ -97,7 +98,8 @@ class TestRobust:
 class TestBilateralGrid:
     @pytest.mark.usefixtures("x64")
     def test_slices_are_those_of_plain_loops(self):
-        grid, color = RNG.normal(size=(3, 2, 4, 3, 4)), RNG.uniform(size=(5, 7, 3))
+        grid = RNG.normal(size=(3, 2, 4, 3, 4))
+        color = RNG.uniform(size=(5, 7, 3))
         found = BilateralGrid().color(jnp.asarray(grid), jnp.asarray(color))
         for y, x in np.ndindex(5, 7):
             luminance = color[y, x] @ (0.299, 0.587, 0.114)
@@ -111,17 +113,20 @@ class TestBilateralGrid:
     @pytest.mark.usefixtures("x64")
     def test_gradients_are_exact(self):
         numbers = np.concatenate([RNG.normal(size=96), RNG.uniform(0.1, 0.4, size=18)])
-        weights, correction = jnp.asarray(RNG.normal(size=(2, 3, 3))), BilateralGrid(smoothness=1.0)
+        weights = jnp.asarray(RNG.normal(size=(2, 3, 3)))
+        correction = BilateralGrid(smoothness=1.0)
 
         def value(numbers):
-            grid, color = numbers[:96].reshape(2, 2, 2, 3, 4), numbers[96:].reshape(2, 3, 3)
+            grid = numbers[:96].reshape(2, 2, 2, 3, 4)
+            color = numbers[96:].reshape(2, 3, 3)
             return jnp.sum(weights * correction.color(grid, color)) + correction.penalty(grid)
 
         found = jax.jit(jax.grad(value))(jnp.asarray(numbers))
         np.testing.assert_allclose(found, differences(value, numbers), rtol=1e-6, atol=1e-8)
 
     def test_it_begins_as_the_identity_and_holds_every_affine_map(self):
-        correction, color = BilateralGrid(size=(3, 2, 4)), jnp.asarray(RNG.uniform(size=(6, 5, 3)), jnp.float32)
+        correction = BilateralGrid(size=(3, 2, 4))
+        color = jnp.asarray(RNG.uniform(size=(6, 5, 3)), jnp.float32)
         neutral = jnp.asarray(correction.neutral, jnp.float32)
         np.testing.assert_allclose(correction.color(neutral, color), color, atol=1e-6)
         assert correction.penalty(neutral) == 0
@@ -154,7 +159,8 @@ def depth_term(kind="inverse"):
 class TestDepthPrior:
     @pytest.mark.usefixtures("x64")
     def test_scale_and_shift_are_those_of_least_squares(self):
-        prior, counts = RNG.uniform(size=(6, 7)), RNG.random((6, 7)) < 0.7
+        prior = RNG.uniform(size=(6, 7))
+        counts = RNG.random((6, 7)) < 0.7
         inverse = 2 * prior + 3 + 0.3 * RNG.normal(size=(6, 7))
         columns = np.stack([prior[counts], np.ones(counts.sum())], axis=1)
         expected = np.linalg.lstsq(columns, inverse[counts], rcond=None)[0]
@@ -167,8 +173,10 @@ class TestDepthPrior:
     @pytest.mark.usefixtures("x64")
     def test_gradients_are_exact_with_scale_and_shift_held(self):
         images = jnp.asarray(np.stack([RNG.uniform(1, 2, (3, 4)), RNG.uniform(0.6, 1, (3, 4))]))
-        prior, counts = jnp.asarray(RNG.uniform(size=(3, 4))), jnp.asarray(RNG.random((3, 4)) < 0.8)
-        inverse, num = jnp.where(counts, images[1] / images[0], 0), float(counts.sum())
+        prior = jnp.asarray(RNG.uniform(size=(3, 4)))
+        counts = jnp.asarray(RNG.random((3, 4)) < 0.8)
+        inverse = jnp.where(counts, images[1] / images[0], 0)
+        num = float(counts.sum())
         scale, shift = scale_and_shift(jnp.where(counts, prior, 0), inverse, counts)
 
         def held(images):
@@ -250,7 +258,8 @@ class TestFloaters:
     @pytest.mark.long
     def test_views_are_counted_as_each_alone_says(self):
         scene = draw_scene(0)._replace(textures=None)
-        model, camera = a2tg.Model(as_gaussians(scene, "float32")), as_camera(scene, "float32")
+        model = a2tg.Model(as_gaussians(scene, "float32"))
+        camera = as_camera(scene, "float32")
         picture = np.zeros((camera.height, camera.width, 3), np.uint8)
         turned = dataclasses.replace(camera, viewmat=camera.viewmat.at[0, 3].add(0.7))
         views = [a2tg.View(str(index), each, picture) for index, each in enumerate((camera, turned))]
@@ -266,7 +275,8 @@ class TestFloaters:
 
     def test_what_is_close_before_a_camera(self, scene):
         camera = scene.train[0].camera
-        forward, right = np.asarray(camera.viewmat)[2, :3], np.asarray(camera.viewmat)[0, :3]
+        forward = np.asarray(camera.viewmat)[2, :3]
+        right = np.asarray(camera.viewmat)[0, :3]
         center = np.asarray(camera.center)
         points = np.stack(
             [center + 0.1 * forward, center + 0.5 * forward, center - 0.1 * forward, center + 0.1 * right]
@@ -282,9 +292,11 @@ class TestFloaters:
         rays[0, 0] = np.nan
         wide = dataclasses.replace(view, camera=dataclasses.replace(view.camera, rays=jnp.asarray(rays)))
         pixels = np.asarray([[-1.5, 0.5], [2.5, 1.5], [3.5, 0.5], [0.5, -1.5]]) * (width, height)
-        K, viewmat = np.asarray(view.camera.K), np.asarray(view.camera.viewmat)
+        K = np.asarray(view.camera.K)
+        viewmat = np.asarray(view.camera.viewmat)
         seen = 0.1 * np.concatenate([pixels, np.ones((4, 1))], axis=1) @ np.linalg.inv(K).T
-        points, near = (seen - viewmat[:3, 3]) @ viewmat[:3, :3], 0.2
+        points = (seen - viewmat[:3, 3]) @ viewmat[:3, :3]
+        near = 0.2
         np.testing.assert_array_equal(are_near(points, [wide], near), [True, True, False, False])
         np.testing.assert_array_equal(are_near(points, [view], near), False)
         unseen = dataclasses.replace(wide, camera=dataclasses.replace(wide.camera, rays=jnp.full_like(rays, np.nan)))
@@ -297,7 +309,8 @@ class TestFloaters:
         assert not are_near(np.asarray(model.gaussians.means), scene.train, 0.2).any()
 
     def test_they_are_pruned_while_others_grow(self):
-        system, late = a2tg.Gaussians2d(), a2tg.PruneFloaters(min_views=0, near=0.2, at=(0.5, 0.8))
+        system = a2tg.Gaussians2d()
+        late = a2tg.PruneFloaters(min_views=0, near=0.2, at=(0.5, 0.8))
         floaters = dataclasses.replace(late, at=(0.3, 0.4, 0.5))
         (stage,) = dataclasses.replace(system, floaters=floaters).stages()
         assert stage.events[-1].at == (0.3, 0.4)
@@ -319,7 +332,8 @@ class TestSupersampling:
     @pytest.mark.long
     def test_a_pixel_is_the_mean_of_a_finer_view(self):
         scene = draw_scene(0)._replace(textures=None)
-        model, camera = a2tg.Model(as_gaussians(scene, "float32")), as_camera(scene, "float32")
+        model = a2tg.Model(as_gaussians(scene, "float32"))
+        camera = as_camera(scene, "float32")
         found = a2tg.Renderer(model, settings=a2tg.RenderSettings(supersample=2))(camera)
         fine = a2tg.Renderer(model)(a2tg.resize_camera(camera, 2 * camera.width, 2 * camera.height))
         for name in ("color", "depth", "normal"):

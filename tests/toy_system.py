@@ -67,5 +67,6 @@ class Toy(a2tg.System):
 
     def stages(self):
         losses = (*self.loss.terms(), a2tg.Term(contrast, self.contrast_weight))
-        rings, events = Rings(), (Shrink(self.factor),)
+        rings = Rings()
+        events = (Shrink(self.factor),)
         return (a2tg.Stage("rings", rings, events, losses, self.rates, self.stage1_iterations, self.rings_rate),)
