@@ -156,7 +156,9 @@ class Stage(NamedFields):
     @functools.cached_property
     def times(self) -> tuple[Times, ...]:
         """Iterations after which each event happens (host)."""
-        return tuple(event.times(self.iterations) for event in self.events)
+        # Events may compute them by JAX, and a checkpoint is read while shapes are traced.
+        with jax.ensure_compile_time_eval():
+            return tuple(event.times(self.iterations) for event in self.events)
 
     def check(self) -> None:
         """Check all fields.
