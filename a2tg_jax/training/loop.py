@@ -333,8 +333,8 @@ class StageRun:
         return info
 
     def _memory_of(self, arguments: tuple[Any, ...]) -> float:
-        """Compile the first step, and return the bytes in use while it runs. Raises ValueError if it cannot fit, or, as
-        far as is known, a later stage of the run."""
+        """Compile the first step, and return the bytes in use while it runs. Raises ValueError if it cannot fit, or
+        if a later stage of the run probably cannot."""
         # The call that follows finds this program, in JAX's cache of this process.
         step = jitted_step().lower(*arguments).compile()
         own = sum(leaf.nbytes for leaf in jax.tree.leaves(self.state.model))
