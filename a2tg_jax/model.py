@@ -328,7 +328,7 @@ def concatenate(models: Sequence[Model]) -> Model:
         if options is not None and others is not None and options.extent != others.extent:
             raise ValueError(
                 f"models must have textures of one extent; got {options.extent:g} and {others.extent:g}: train them "
-                "with the same lookup.extent, or bake them first (a2tg convert --bake)"
+                "with the same lookup.extent, or convert them to plain Gaussians first"
             )
         if template_of(model.appearance) != template_of(first.appearance):
             expected = in_words(first.appearance)

@@ -5,6 +5,7 @@ import importlib
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,19 @@ def test_one_module_tells_systems_apart():
         "rasterize/kernels/native/llvm_code.py",
         "results/report.py",
     }
+
+
+def test_the_library_names_no_command():
+    """Neither in messages nor in docstrings. The rooms of the library are those of the contract of `lint-imports`."""
+    settings = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"]
+    (rooms,) = [
+        c["source_modules"] for c in settings["contracts"] if c["name"].startswith("The library has no command")
+    ]
+    paths = [path for path in MODULES if f"a2tg_jax.{path.relative_to(PACKAGE).with_suffix('').parts[0]}" in rooms]
+    assert len(paths) > 80
+    for path in paths:
+        found = re.findall(r"\ba2tg [a-z]+|[ (`]--[a-z-]+", path.read_text(encoding="utf-8"))
+        assert not found, (path, found)
 
 
 def test_import_leaves_jax_alone():

@@ -11,17 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from a2tg_jax import Camera, Gaussians, RenderSettings, Textures, allocate_textures, init_from_points, render_image
 from a2tg_jax.base.machine import VARIABLE, memory_limit, num_threads
 from a2tg_jax.base.operating_system import cuda_of_driver
-from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.gaussians import Gaussians, init_from_points
 from a2tg_jax.core.numerics import MOST_DIFFERENCE, relative_difference
 from a2tg_jax.host.startup import compilation_cache_folder
 from a2tg_jax.rasterize.kernels import platforms
-from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.splats import Compositor
-from a2tg_jax.render import render_image
-from a2tg_jax.texture import Textures, allocate_textures
 
 PACKAGES = ("jax", "jaxlib", "jax-cuda13-plugin", "jaxopt", "numpy", "llvmlite", "nvidia-cuda-nvrtc", "pycolmap")
 WIDTH = 96

@@ -15,7 +15,7 @@ import jax
 import tyro
 from tyro.conf import Fixed, Positional, Suppress, UseAppendAction, arg
 
-from a2tg_jax.adapt import Upscale
+from a2tg_jax import A2tg, Mcmc, Scene, Session, Upscale
 from a2tg_jax.base.machine import tidy_memory
 from a2tg_jax.base.operating_system import has_display
 from a2tg_jax.base.regular_files import expanded
@@ -25,7 +25,6 @@ from a2tg_jax.cli.processes import AUTO, ProcessPlace, joined
 from a2tg_jax.core.budget import budget_in_bytes
 from a2tg_jax.core.config_json import flatten_config
 from a2tg_jax.data.load import SceneSource
-from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.results.commands import file_command, resuming_command
 from a2tg_jax.results.folder import RunFolder, open_run, opened
 from a2tg_jax.results.forecast import room_for_photographs
@@ -42,9 +41,6 @@ from a2tg_jax.results.report import RunResult, sizes_line, summary_text
 from a2tg_jax.results.run_processes import check_batch_sizes, follow_first_process
 from a2tg_jax.results.run_training import RunOptions, begin_run, resume_run, unseen, warn
 from a2tg_jax.results.viewing import shown_live
-from a2tg_jax.scene import Scene
-from a2tg_jax.systems.a2tg import A2tg
-from a2tg_jax.training import Session
 from a2tg_jax.training.loop import Watch
 
 FLAGS[SceneSource] = {"path": (Positional, arg(metavar="SCENE"))}

@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from a2tg_jax import DepthMap, Mask, Picture, Scene
 from a2tg_jax.core.camera_paths import nearest_point
 from a2tg_jax.core.cameras import check_intrinsics
 from a2tg_jax.core.checks import check_kind, check_shape, check_unmasked, described, kind_of
 from a2tg_jax.core.numerics import evenly_chosen
-from a2tg_jax.core.pictures import DepthMap, Mask, Picture, how_to_convert
+from a2tg_jax.core.pictures import how_to_convert
 from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.data.assembly import (
     PointCloud,
@@ -24,7 +25,6 @@ from a2tg_jax.data.assembly import (
     warn_of_rounding,
 )
 from a2tg_jax.data.photo_points import MOST_VIEWS, Look, agreement
-from a2tg_jax.scene import Scene
 
 OFF_CENTER = 1.25
 """Smallest ratio between image size and twice the principal point, on both axes, that gives a warning."""

@@ -10,9 +10,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from a2tg_jax import Scene, Similarity
 from a2tg_jax.base.regular_files import is_regular, names_in
 from a2tg_jax.base.text import counted
-from a2tg_jax.core.similarity import Similarity, camera_centers
+from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.data.assembly import PointCloud, assemble_scene, every_kth, rigid_viewmat, scene_name
 from a2tg_jax.data.colmap_cameras import ColmapCamera
 from a2tg_jax.data.colmap_files import KINDS, POINT, FrameRecord, ImageRecord, RigRecord, num_images, read_file
@@ -20,7 +21,6 @@ from a2tg_jax.data.image_files import inside, on_disk, warn_of_unposed
 from a2tg_jax.data.lenses import checked_lens
 from a2tg_jax.data.photo_reading import Options, Photo, read_photos
 from a2tg_jax.data.ply import read_ply_points
-from a2tg_jax.scene import Scene
 
 SUFFIXES = (".bin", ".txt")
 """Suffixes of a model's files, in COLMAP's order of preference."""

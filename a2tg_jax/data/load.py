@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
+from a2tg_jax import Scene
 from a2tg_jax.base.regular_files import expanded, is_regular
 from a2tg_jax.core.checks import check_literal
 from a2tg_jax.data.assembly import check_test_every, scene_name, warn_of_lenses, with_validation_views
@@ -29,7 +30,6 @@ from a2tg_jax.data.transforms import (
     transforms_in,
 )
 from a2tg_jax.host.command_words import as_argument
-from a2tg_jax.scene import Scene
 
 HeldOut = Literal["test", "validation"]
 OTHER_PROGRAMS: tuple[Callable[[Path], list[Cameras]], ...] = (polycam, record3d, metashape, realityscan)

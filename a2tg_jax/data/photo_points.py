@@ -13,9 +13,9 @@ import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.spatial import cKDTree
 
+from a2tg_jax import Mask, Picture
 from a2tg_jax.core.cameras import pinhole_pixels
 from a2tg_jax.core.geometry import NEAR_PLANE
-from a2tg_jax.core.pictures import Mask, Picture
 
 # Chosen in experiments/NOTEBOOK.md, "A start from photographs".
 MOST_VIEWS = 32

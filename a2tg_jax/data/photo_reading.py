@@ -23,9 +23,9 @@ import numpy as np
 from PIL import Image
 from scipy.ndimage import maximum_filter, minimum_filter
 
+from a2tg_jax import DepthMap, Mask
 from a2tg_jax.base.npz import read_npy
 from a2tg_jax.base.text import shortened
-from a2tg_jax.core.pictures import DepthMap, Mask
 from a2tg_jax.data.assembly import Shot
 from a2tg_jax.data.decoding import MAX_PIXELS, picture_size, read_grey, read_pixels
 from a2tg_jax.data.image_files import find_image, map_in_threads, on_disk

@@ -9,8 +9,9 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from a2tg_jax import Picture
 from a2tg_jax.base.machine import cache_folder, memory_limit
-from a2tg_jax.core.pictures import Picture, checksum_of
+from a2tg_jax.core.pictures import checksum_of
 from a2tg_jax.data.decoding import read_pixels
 
 SHARE_OF_MEMORY = 0.25

@@ -29,10 +29,10 @@ OFFSET = "offset"
 """First word of the comment with the origin of positions."""
 ROTATION = "rotation"
 """First word of the comment with the rotation (wxyz) from the original world to the file's."""
-RGB = ("red", "green", "blue")
+RGB: tuple[str, ...] = ("red", "green", "blue")
 COLORS = (RGB, ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 """Names of colours, in order of preference."""
-SH_DEGREE0 = ("f_dc_0", "f_dc_1", "f_dc_2")
+SH_DEGREE0: tuple[str, ...] = ("f_dc_0", "f_dc_1", "f_dc_2")
 FLOAT_RANGES = (1, 255, 65535)
 INTEGER_RANGES = (255, 65535, 2**32 - 1)
 """Largest values of colours in files."""

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 
+from a2tg_jax import Picture, Scene
 from a2tg_jax.core.cameras import intrinsics, looking
-from a2tg_jax.core.pictures import Picture
 from a2tg_jax.data import patterns
 from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, check_test_every, every_kth
 from a2tg_jax.data.ray_tracing import (
@@ -29,7 +29,6 @@ from a2tg_jax.data.ray_tracing import (
     nearest_hits,
     trace_rays,
 )
-from a2tg_jax.scene import Scene
 
 TARGET = np.array([0.0, 0.1, 0.45])
 """Point of the still life that all cameras look at."""

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from a2tg_jax import Scene
 from a2tg_jax.base.json_text import number_of, read_json
 from a2tg_jax.base.regular_files import is_regular, names_in
 from a2tg_jax.base.text import first_names, shortened
@@ -29,7 +30,6 @@ from a2tg_jax.data.image_files import inside
 from a2tg_jax.data.lenses import Lens, LensUse, checked_lens
 from a2tg_jax.data.photo_reading import Counted, Options, Photo, read_photos
 from a2tg_jax.data.ply import read_ply_points
-from a2tg_jax.scene import Scene
 
 NERFSTUDIO_FILE = "transforms.json"
 BLENDER_FILES = ("transforms_train.json", "transforms_test.json")

@@ -18,31 +18,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.appearance.parts import (
-    MAX_DEGREE,
-    TextureOptions,
-    curves_of,
-    falloff_of,
-    nearest_gaussians,
-    texel_coordinates,
-)
+from a2tg_jax import Camera, Gaussians, Gaussians2d, Model, Renderer, Scene, Similarity, TextureOptions, View, fit_stage
+from a2tg_jax.appearance.parts import MAX_DEGREE, curves_of, falloff_of, nearest_gaussians, texel_coordinates
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.camera_paths import without_outlying
-from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.gaussians import SH_C0, Gaussians, floats_per_gaussian, logit, rotation_matrices
+from a2tg_jax.core.gaussians import SH_C0, floats_per_gaussian, logit, rotation_matrices
 from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.origin import Color
 from a2tg_jax.core.sh import NUM_BASES
-from a2tg_jax.core.similarity import Similarity, camera_centers
+from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.data.assembly import scene_scale
 from a2tg_jax.finish.shrinking import fewest_texels, texel_weights
 from a2tg_jax.host.training_bar import ProgressBar
-from a2tg_jax.model import Model, plain_gaussians
-from a2tg_jax.renderer import Renderer
-from a2tg_jax.scene import Scene, View
-from a2tg_jax.systems.baselines import Gaussians2d
+from a2tg_jax.model import plain_gaussians
 from a2tg_jax.texture import NEUTRAL_TEXEL
-from a2tg_jax.training import fit_stage
 from a2tg_jax.training.reports import Progress
 from a2tg_jax.training.stage import BACKGROUNDS, Background
 

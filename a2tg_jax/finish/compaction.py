@@ -15,16 +15,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from a2tg_jax.core.cameras import Camera
+from a2tg_jax import Camera, Model, Renderer, RenderSettings, View, view_image
 from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.origin import Color
 from a2tg_jax.host.progress_bars import progress_over
 from a2tg_jax.io.columns import Precision
 from a2tg_jax.io.compact import CompactChoices, decode_model, encode_model
-from a2tg_jax.model import Model, check_is_model
-from a2tg_jax.rasterize.render_types import RenderSettings
-from a2tg_jax.renderer import Renderer
-from a2tg_jax.scene import View, check_are_views, view_image
+from a2tg_jax.model import check_is_model
+from a2tg_jax.scene import check_are_views
 
 Loss = Callable[[Model], float]
 Ladder = Mapping[str, tuple[Precision, ...]]

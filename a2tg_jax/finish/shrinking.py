@@ -19,19 +19,17 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
+from a2tg_jax import Camera, Gaussians, Model, RenderSettings, Textures, View, plan_render
 from a2tg_jax.appearance import in_words
-from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.gaussians import SH_C0, Gaussians
+from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.core.origin import Color
 from a2tg_jax.core.table import Group
 from a2tg_jax.finish.compaction import loss_on_views
-from a2tg_jax.model import Model, check_is_model
-from a2tg_jax.rasterize.render_types import RenderSettings
+from a2tg_jax.model import check_is_model
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.render import background_array
-from a2tg_jax.renderer import plan_render
-from a2tg_jax.scene import View, check_are_views
-from a2tg_jax.texture import BYTES_PER_TEXEL, NEUTRAL_TEXEL, Textures
+from a2tg_jax.scene import check_are_views
+from a2tg_jax.texture import BYTES_PER_TEXEL, NEUTRAL_TEXEL
 
 LEAST_OPACITY = 1e-4
 """Smallest opacity after absorbing a texel's alpha, and distance of the largest from 1: logits must be finite."""

@@ -16,15 +16,29 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from a2tg_jax import (
+    AdamState,
+    Change,
+    Correction,
+    DivergedError,
+    Gaussians,
+    Model,
+    Now,
+    Scene,
+    Stage,
+    StepEvent,
+    System,
+    combine,
+    fit_stage,
+    partition,
+    pytree,
+)
 from a2tg_jax.appearance import in_words, template_of
 from a2tg_jax.appearance.parts import LARGEST_LOG_EXPONENT, MAX_DEGREE, MOST_SHARE
 from a2tg_jax.core.checks import check_untraced
-from a2tg_jax.core.gaussians import Gaussians, logit
+from a2tg_jax.core.gaussians import logit
 from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.numerics import normalize
-from a2tg_jax.core.optim import AdamState
-from a2tg_jax.core.pytree import combine, partition, pytree
-from a2tg_jax.events import Change, Now, StepEvent
 from a2tg_jax.finish.compaction import (
     LADDER,
     Ladder,
@@ -40,10 +54,6 @@ from a2tg_jax.host.training_bar import ProgressBar
 from a2tg_jax.io.columns import LEAST_OPACITY
 from a2tg_jax.io.compact import CompactChoices, Grids, encode_model, grids_of, half_turned
 from a2tg_jax.io.model_rows import check_encodable
-from a2tg_jax.model import Model
-from a2tg_jax.scene import Scene
-from a2tg_jax.training import DivergedError, Stage, System, fit_stage
-from a2tg_jax.training.corrections import Correction
 from a2tg_jax.training.reports import Progress
 
 ITERATIONS = 1000

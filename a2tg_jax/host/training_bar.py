@@ -5,9 +5,9 @@ import sys
 import time
 from collections.abc import Mapping
 
+from a2tg_jax import Display
 from a2tg_jax.base.text import in_bytes
 from a2tg_jax.host.progress_bars import has_terminal, is_line_due, new_bar
-from a2tg_jax.training.reports import Display
 
 MOMENTUM = 0.95
 BAR = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]"

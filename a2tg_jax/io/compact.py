@@ -15,7 +15,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from a2tg_jax.appearance import Appearance
+from a2tg_jax import Appearance, Model
 from a2tg_jax.appearance.parts import MAX_DEGREE, log_exponents_of, shapes_of
 from a2tg_jax.base.atomic import write_whole
 from a2tg_jax.base.json_text import parse_json
@@ -40,7 +40,7 @@ from a2tg_jax.io.columns import (
     with_w,
 )
 from a2tg_jax.io.model_rows import Rows, check_encodable, joined_rows, model_of, ordered, rows_of_model
-from a2tg_jax.model import Model, check_is_model
+from a2tg_jax.model import check_is_model
 from a2tg_jax.model_file import (
     appearance_from_dict,
     appearance_to_dict,

@@ -5,6 +5,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+from a2tg_jax import Model, load_model, save_model
 from a2tg_jax.base.regular_files import expanded, is_regular
 from a2tg_jax.base.text import did_you_mean, shortened
 from a2tg_jax.core.origin import BLACK
@@ -19,8 +20,6 @@ from a2tg_jax.io.splat_files import decode_ksplat, decode_splat, encode_ksplat, 
 from a2tg_jax.io.spz import decode_spz, encode_spz
 from a2tg_jax.io.torch_checkpoint import save_checkpoint_gaussians
 from a2tg_jax.io.usd import import_usd, load_usd, save_usd
-from a2tg_jax.model import Model
-from a2tg_jax.model_file import load_model, save_model
 
 LEARNED = {
     "exposure": "learned exposures",

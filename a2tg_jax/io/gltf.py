@@ -12,7 +12,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from a2tg_jax.appearance import Appearance, TextureOptions, appearance_for
+from a2tg_jax import Appearance, Model, TextureOptions
+from a2tg_jax.appearance import appearance_for
 from a2tg_jax.appearance.base import PARTS
 from a2tg_jax.appearance.parts import MAX_DEGREE, log_exponents_of, shapes_of
 from a2tg_jax.base.json_text import numbers_of
@@ -40,7 +41,7 @@ from a2tg_jax.io.other_programs import (
     upright,
 )
 from a2tg_jax.io.spz import GLTF_AXES, decode_spz
-from a2tg_jax.model import Model, checked_live
+from a2tg_jax.model import checked_live
 from a2tg_jax.model_file import appearance_from_dict, appearance_to_dict, background_of, origin_of
 from a2tg_jax.texture import MAX_SIDE
 

@@ -11,12 +11,12 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.appearance import Appearance, in_words
+from a2tg_jax import Appearance, Gaussians, Model, Origin
+from a2tg_jax.appearance import in_words
 from a2tg_jax.appearance.files import arrays_of, with_arrays
-from a2tg_jax.core.gaussians import Gaussians
-from a2tg_jax.core.origin import Color, Origin
+from a2tg_jax.core.origin import Color
 from a2tg_jax.core.sh import NUM_BASES
-from a2tg_jax.model import Model, check_model
+from a2tg_jax.model import check_model
 
 HALF_TURNS = np.array(
     [

@@ -5,9 +5,10 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from a2tg_jax import Camera
 from a2tg_jax.base.json_text import numbers_of
 from a2tg_jax.base.text import shortened
-from a2tg_jax.core.cameras import Camera, check_calibration, check_camera
+from a2tg_jax.core.cameras import check_calibration, check_camera
 from a2tg_jax.io.saved_file import load_saved
 
 # A file may come from a stranger: sides decide how much memory a frame takes.

@@ -24,13 +24,13 @@ import numpy as np
 from numpy.typing import DTypeLike
 from scipy.spatial.transform import Rotation
 
+from a2tg_jax import Gaussians, Model, Similarity
 from a2tg_jax.appearance.parts import LEAST_OPACITY
 from a2tg_jax.base.atomic import write_whole
 from a2tg_jax.base.regular_files import check_exists, expanded, open_regular, reading
 from a2tg_jax.base.suffixes import check_suffix
-from a2tg_jax.core.gaussians import SH_C0, Gaussians, rotation_matrices
+from a2tg_jax.core.gaussians import SH_C0, rotation_matrices
 from a2tg_jax.core.sh import NUM_BASES
-from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.data.other_runs import model_hint
 from a2tg_jax.data.ply import OFFSET, RGB, ROTATION, SH_DEGREE0, PlyFile, largest_color
 from a2tg_jax.io.columns import logits_of
@@ -54,7 +54,7 @@ from a2tg_jax.io.other_programs import (
     without_largest,
     world_gaussians,
 )
-from a2tg_jax.model import Model, check_model
+from a2tg_jax.model import check_model
 
 MEANS = ("x", "y", "z")
 NORMALS = ("nx", "ny", "nz")

@@ -23,6 +23,7 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 from scipy import sparse
 
+from a2tg_jax import Model
 from a2tg_jax.base.json_text import numbers_of, parse_json
 from a2tg_jax.base.regular_files import existing_bytes, read_regular, reading, room_of
 from a2tg_jax.base.text import PROGRAM, shortened
@@ -41,7 +42,6 @@ from a2tg_jax.io.other_programs import (
     without_largest,
 )
 from a2tg_jax.io.ply import place_marks
-from a2tg_jax.model import Model
 
 HEADER = "meta.json"
 STREAMED_HEADER = "lod-meta.json"

@@ -24,10 +24,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from a2tg_jax import Gaussians, Model, Similarity, transform_gaussians
 from a2tg_jax.base.regular_files import room_of
-from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.sh import NUM_BASES
-from a2tg_jax.core.similarity import Similarity, transform_gaussians
 from a2tg_jax.io.columns import unzstd
 from a2tg_jax.io.other_programs import (
     Ellipsoids,
@@ -40,7 +39,6 @@ from a2tg_jax.io.other_programs import (
     with_largest,
     without_largest,
 )
-from a2tg_jax.model import Model
 
 MAGIC = b"NGSP"
 GZIP_MAGIC = b"\x1f\x8b"

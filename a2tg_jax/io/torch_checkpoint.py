@@ -14,11 +14,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from a2tg_jax import Gaussians, Model
 from a2tg_jax.base.atomic import replacing
-from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.io.other_programs import World, third_log_scales, warn_of_offset, world_gaussians
-from a2tg_jax.model import Model, check_model
+from a2tg_jax.model import check_model
 
 PROTOCOL = 2
 """Version of pickles, as `torch.save` writes them."""

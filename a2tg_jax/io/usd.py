@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from a2tg_jax import Model
 from a2tg_jax.base.atomic import replacing
 from a2tg_jax.base.json_text import parse_json
 from a2tg_jax.base.npz import read_npz
@@ -36,7 +37,7 @@ from a2tg_jax.io.other_programs import (
     splats_of,
     upright,
 )
-from a2tg_jax.model import Model, checked_live
+from a2tg_jax.model import checked_live
 from a2tg_jax.model_file import background_of, origin_of
 
 ORIGIN = "a2tg:origin"

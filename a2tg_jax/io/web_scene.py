@@ -8,6 +8,7 @@ import dataclasses
 
 import numpy as np
 
+from a2tg_jax import Model
 from a2tg_jax.core.camera_paths import central_camera
 from a2tg_jax.core.gaussians import check_gaussians
 from a2tg_jax.core.numerics import evenly_chosen
@@ -15,7 +16,7 @@ from a2tg_jax.io.columns import Choice, opacities_of
 from a2tg_jax.io.compact import CompactChoices, encode_model
 from a2tg_jax.io.edit_file import scores_of
 from a2tg_jax.io.model_rows import check_encodable
-from a2tg_jax.model import Model, check_model
+from a2tg_jax.model import check_model
 
 CHOICES = CompactChoices(
     means=16, log_scales=8, quats=8, opacities=8, sh_0=8, sh_rest=6, texels=8, shapes=8, coder="deflate"

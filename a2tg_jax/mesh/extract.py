@@ -12,18 +12,17 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from a2tg_jax import Camera, Model, Renderer, RenderSettings
 from a2tg_jax.base.text import counted
 from a2tg_jax.core.camera_paths import nearest_point, outlying_cameras
-from a2tg_jax.core.cameras import Camera, checked_cameras
+from a2tg_jax.core.cameras import checked_cameras
 from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.host.optional import optional
 from a2tg_jax.host.progress_bars import progress_over
 from a2tg_jax.mesh.fusion import SIDE, VOXELS, BlockGrid, GridFullError, Space, fuse, rendered_depth
 from a2tg_jax.mesh.triangles import Mesh, largest_clusters
-from a2tg_jax.model import Model, check_is_model
-from a2tg_jax.rasterize.render_types import RenderSettings
-from a2tg_jax.renderer import Renderer
+from a2tg_jax.model import check_is_model
 
 MARCHING_CUBES = "skimage.measure", "a mesh needs scikit-image", "train"
 RESOLUTION = 512

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from a2tg_jax import Origin, Similarity
 from a2tg_jax.base.atomic import replacing, write_whole
 from a2tg_jax.base.regular_files import expanded
-from a2tg_jax.core.origin import Origin
-from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.io.gltf import OWN
 from a2tg_jax.io.gltf_container import Builder, scene_of_one
 from a2tg_jax.io.other_programs import linear_colors, matrix_of, upright

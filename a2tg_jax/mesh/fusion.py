@@ -12,10 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.core.cameras import Camera, back_project
+from a2tg_jax import Camera, RenderOutput, pytree, static
+from a2tg_jax.core.cameras import back_project
 from a2tg_jax.core.numerics import normalize
-from a2tg_jax.core.pytree import pytree, static
-from a2tg_jax.rasterize.render_types import RenderOutput
 
 TRUNCATION = 5.0
 """Truncation of signed distances in voxels."""

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
-from a2tg_jax.core.cameras import Camera
+from a2tg_jax import Camera
 from a2tg_jax.host.optional import optional
 from a2tg_jax.mesh.triangles import Mesh
 

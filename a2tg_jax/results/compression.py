@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
+from a2tg_jax import Model, RenderSettings, Scene, System
 from a2tg_jax.base.atomic import write_whole
 from a2tg_jax.base.text import in_bytes, shortened
 from a2tg_jax.core.budget import budget_in_bytes
@@ -38,15 +39,11 @@ from a2tg_jax.finish.tuning import (
 from a2tg_jax.io.compact import GROUPS, CompactChoices, encode_model
 from a2tg_jax.io.formats import FORMATS
 from a2tg_jax.io.model_rows import check_encodable
-from a2tg_jax.model import Model
-from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.model_source import open_source
 from a2tg_jax.results.output_paths import check_export, check_output
 from a2tg_jax.results.report import aligned, loss_text
 from a2tg_jax.results.run_evaluation import refined_views
-from a2tg_jax.scene import Scene
-from a2tg_jax.training import System
 
 SUFFIX = ".a2tgz"
 MAX_LOSS = 0.05

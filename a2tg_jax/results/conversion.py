@@ -8,6 +8,7 @@ import time
 from importlib.metadata import version
 from pathlib import Path
 
+from a2tg_jax import Model, load_model, save_model
 from a2tg_jax.base.archive import read_archive_header
 from a2tg_jax.base.regular_files import is_regular, sha256_of
 from a2tg_jax.base.text import counted, in_bytes
@@ -26,8 +27,7 @@ from a2tg_jax.io.formats import (
 from a2tg_jax.io.other_programs import World, world_line
 from a2tg_jax.io.ply import save_ply
 from a2tg_jax.io.sog import HEADER
-from a2tg_jax.model import Model
-from a2tg_jax.model_file import FORMAT, load_model, save_model
+from a2tg_jax.model_file import FORMAT
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.model_source import Source, open_source
 from a2tg_jax.results.output_paths import check_new, check_output

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from PIL import ImageColor
 
+from a2tg_jax import Model, Origin
 from a2tg_jax.base.text import did_you_mean
 from a2tg_jax.core.camera_paths import vertical_in
-from a2tg_jax.core.origin import Color, Origin
+from a2tg_jax.core.origin import Color
 from a2tg_jax.io.edit_file import Edit, apply_edit, crop_box, save_edit
-from a2tg_jax.model import Model
 from a2tg_jax.results.conversion import check_conversion, write_converted
 from a2tg_jax.results.model_source import open_source
 from a2tg_jax.results.output_paths import check_new, check_output

@@ -16,18 +16,13 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from a2tg_jax import Camera, History, Model, Renderer, RenderOutput, RenderSettings, texture_arrays
 from a2tg_jax.base.atomic import replacing
 from a2tg_jax.base.text import PROGRAM
-from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.data.colmap import read_cameras_and_points
-from a2tg_jax.model import Model
-from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
-from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.images import checkered, save_picture, to_uint8
-from a2tg_jax.texture import texture_arrays
-from a2tg_jax.training import History
 
 COLORS = ("#4477aa", "#cc3311", "#777777", "#228833", "#aa3377", "#ccaa33", "#66ccee")
 """Colours of the stages, in turn."""

@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+from a2tg_jax import Model, Scene, evaluate, load_model, save_model
 from a2tg_jax.base.atomic import replacing
 from a2tg_jax.base.json_text import read_json
 from a2tg_jax.base.regular_files import is_regular, sha256_of
@@ -13,9 +14,6 @@ from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.finish.polishing import polish
 from a2tg_jax.finish.shrinking import can_shrink, shrink_textures
 from a2tg_jax.host.progress_bars import counting
-from a2tg_jax.measure.evaluation import evaluate
-from a2tg_jax.model import Model
-from a2tg_jax.model_file import load_model, save_model
 from a2tg_jax.results.finish_record import FinishOptions
 from a2tg_jax.results.folder import RunFolder, check_free, claimed, write_json
 from a2tg_jax.results.model_source import finished_stage, settings_of
@@ -23,7 +21,6 @@ from a2tg_jax.results.plan import PlannedStage
 from a2tg_jax.results.record import RunRecord, write_record
 from a2tg_jax.results.report import aligned
 from a2tg_jax.results.run_evaluation import evaluate_run, finished_stages, refined_views
-from a2tg_jax.scene import Scene
 from a2tg_jax.training.registry import system_to_dict
 
 MOST_VIEWS = 16

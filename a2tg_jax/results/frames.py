@@ -15,15 +15,14 @@ from typing import Literal, get_args
 
 from PIL import Image
 
+from a2tg_jax import Camera, Model, Renderer, path_through, smooth_path
 from a2tg_jax.base.atomic import replacing, write_whole
 from a2tg_jax.base.regular_files import is_regular, read_regular
 from a2tg_jax.base.text import did_you_mean, shortened
-from a2tg_jax.core.camera_paths import path_through, smooth_path, turntable, without_outlying
-from a2tg_jax.core.cameras import Camera, crop_camera
+from a2tg_jax.core.camera_paths import turntable, without_outlying
+from a2tg_jax.core.cameras import crop_camera
 from a2tg_jax.host.progress_bars import progress_over
 from a2tg_jax.io.path_file import load_views
-from a2tg_jax.model import Model
-from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.images import picture_names, save_animation, to_uint8, write_png
 from a2tg_jax.results.model_source import open_source

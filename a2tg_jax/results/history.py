@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from a2tg_jax import History
 from a2tg_jax.base.atomic import replacing
 from a2tg_jax.base.regular_files import is_regular, open_regular
 from a2tg_jax.base.text import shortened
 from a2tg_jax.host.optional import optional
 from a2tg_jax.results.folder import RunFolder
-from a2tg_jax.training import History
 from a2tg_jax.training.checkpoint import TERM
 
 NAMES = tuple(History.empty().to_dict())

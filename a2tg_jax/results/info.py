@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from a2tg_jax import Model, load_model
 from a2tg_jax.base.json_text import read_json
 from a2tg_jax.base.regular_files import is_regular
 from a2tg_jax.base.text import in_bytes
 from a2tg_jax.io.formats import file_bytes, format_of, load_splats
-from a2tg_jax.model import Model
-from a2tg_jax.model_file import load_model
 from a2tg_jax.results.commands import repeating_command, resuming_command
 from a2tg_jax.results.folder import RunFolder, iteration_of, old_run
 from a2tg_jax.results.record import is_finished, read_record

@@ -8,18 +8,16 @@ from typing import Literal
 
 import numpy as np
 
+from a2tg_jax import Origin, Renderer, view_image
 from a2tg_jax.base.machine import memory_limit
 from a2tg_jax.base.text import counted, in_bytes
 from a2tg_jax.core.budget import budget_in_bytes
-from a2tg_jax.core.origin import Origin
 from a2tg_jax.host.progress_bars import progress_over
 from a2tg_jax.mesh.extract import MOST_CLUSTERS, check_lengths, extract_mesh
 from a2tg_jax.mesh.files import check_mesh_suffix, save_mesh
 from a2tg_jax.mesh.texturing import Picture, check_texture, texture_mesh
 from a2tg_jax.mesh.triangles import check_simplifying, simplify_mesh
-from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.model_source import Source
-from a2tg_jax.scene import view_image
 
 GRID_SHARE = 0.5
 """Default share of the free memory for voxels."""

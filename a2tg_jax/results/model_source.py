@@ -10,24 +10,21 @@ from pathlib import Path
 
 import numpy as np
 
+from a2tg_jax import History, Model, RenderSettings, Scene, System, load_model, save_model, transform_gaussians
 from a2tg_jax.base.regular_files import is_regular
 from a2tg_jax.base.text import first_names
-from a2tg_jax.core.similarity import transform_gaussians
 from a2tg_jax.data.load import is_scene
 from a2tg_jax.data.other_runs import model_hint
 from a2tg_jax.io.edit_file import apply_edit, load_edit
 from a2tg_jax.io.formats import FORMATS, format_of, load_splats, splats_at
 from a2tg_jax.io.web_scene import encode_web_scene
-from a2tg_jax.model import Model, plain_gaussians
-from a2tg_jax.model_file import load_model, save_model
-from a2tg_jax.rasterize.render_types import RenderSettings
+from a2tg_jax.model import plain_gaussians
 from a2tg_jax.results.commands import first_training_command, resuming_command
 from a2tg_jax.results.folder import RunFolder, open_run, runs_in
 from a2tg_jax.results.history import write_history
 from a2tg_jax.results.plan import PlannedStage
 from a2tg_jax.results.record import RunRecord, read_record
-from a2tg_jax.scene import Scene, origin_of_scene
-from a2tg_jax.training import History, System
+from a2tg_jax.scene import origin_of_scene
 from a2tg_jax.training.stage import BACKGROUNDS
 from a2tg_jax.training.start import left_out, new_appearance, with_degree
 

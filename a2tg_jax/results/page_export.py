@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from a2tg_jax import Origin
 from a2tg_jax.base.atomic import is_left_over, left_over, write_whole
 from a2tg_jax.base.json_text import read_json
 from a2tg_jax.base.text import counted, in_bytes
-from a2tg_jax.core.origin import Origin
 from a2tg_jax.io.compact import decode_model
 from a2tg_jax.io.other_programs import matrix_of
 from a2tg_jax.results.compression import loss_measures

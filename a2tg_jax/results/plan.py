@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from a2tg_jax.training import Stage, System
+from a2tg_jax import Stage, System
 
 LONGEST_WITHOUT_CHECKPOINT = 500
 """Largest number of iterations between checkpoints."""

@@ -27,6 +27,7 @@ from typing import Any, Literal
 
 import tomli_w
 
+from a2tg_jax import Bytewise, System, find_system, like
 from a2tg_jax.base.atomic import write_whole
 from a2tg_jax.base.json_text import MOST_TOML_BYTES, parse_toml
 from a2tg_jax.base.regular_files import expanded, is_regular, read_regular
@@ -38,8 +39,6 @@ from a2tg_jax.io.model_rows import check_encodable
 from a2tg_jax.results.commands import repeating_command
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.plan import RunPlan, plan_run
-from a2tg_jax.systems.bytewise import Bytewise
-from a2tg_jax.training import System, find_system, like
 from a2tg_jax.training.options import own_options
 
 DEFAULT_SYSTEM = "bytewise"

@@ -15,6 +15,19 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
+from a2tg_jax import (
+    Evaluation,
+    Model,
+    Renderer,
+    Scene,
+    System,
+    View,
+    align_poses,
+    evaluate,
+    load_lpips,
+    load_model,
+    view_image,
+)
 from a2tg_jax.base.atomic import write_whole
 from a2tg_jax.base.json_text import read_json
 from a2tg_jax.base.regular_files import sha256_of
@@ -22,12 +35,6 @@ from a2tg_jax.data.assembly import every_kth
 from a2tg_jax.data.load import HeldOut, SceneSource
 from a2tg_jax.io.ply import save_ply
 from a2tg_jax.io.web_scene import encode_web_scene
-from a2tg_jax.measure.alignment import align_poses
-from a2tg_jax.measure.evaluation import Evaluation, evaluate
-from a2tg_jax.measure.metrics import load_lpips
-from a2tg_jax.model import Model
-from a2tg_jax.model_file import load_model
-from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.commands import resuming_command
 from a2tg_jax.results.figures import write_figures
 from a2tg_jax.results.folder import RunFolder, drop_old, write_json
@@ -46,8 +53,6 @@ from a2tg_jax.results.plan import RunPlan
 from a2tg_jax.results.record import read_record
 from a2tg_jax.results.report import Comparison, ModelResult, RunResult, metrics_json, per_view_json, write_report
 from a2tg_jax.results.stage_training import check_held_out
-from a2tg_jax.scene import Scene, View, view_image
-from a2tg_jax.training import System
 from a2tg_jax.training.corrections import learned
 from a2tg_jax.web.page import viewer_html_with
 

@@ -18,12 +18,11 @@ from typing import Any
 import jax
 import numpy as np
 
+from a2tg_jax import DivergedError, Scene, Session, fit_stage, load_checkpoint, load_model
 from a2tg_jax.host import signals
-from a2tg_jax.model_file import load_model
 from a2tg_jax.parallel import any_process, broadcast, check_batch_size, leave
 from a2tg_jax.results.record import RunRecord
-from a2tg_jax.scene import Scene, views_by_kind
-from a2tg_jax.training import DivergedError, Session, fit_stage, load_checkpoint
+from a2tg_jax.scene import views_by_kind
 
 COMPARED = ("options", "`devices`", "views, cameras or points")
 """Facts that processes compare with the first one's."""

@@ -8,13 +8,14 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 
+from a2tg_jax import Checkpoint, DivergedError, Scene, Session, StageResult, fit_stage, save_checkpoint, save_model
 from a2tg_jax.base.machine import Devices
 from a2tg_jax.finish.tuning import ITERATIONS
 from a2tg_jax.host import signals
 from a2tg_jax.host.errors import error_text
 from a2tg_jax.host.training_bar import ProgressBar
 from a2tg_jax.io.formats import load_splats
-from a2tg_jax.model_file import number_in_file, save_model
+from a2tg_jax.model_file import number_in_file
 from a2tg_jax.results.commands import file_command, resuming_command
 from a2tg_jax.results.compression import SUFFIX, CompressOptions, compress
 from a2tg_jax.results.folder import RunFolder, check_free, claimed, iteration_of, put_back_old, set_aside
@@ -28,8 +29,6 @@ from a2tg_jax.results.report import RunResult
 from a2tg_jax.results.run_evaluation import check_weights, evaluate_run
 from a2tg_jax.results.run_processes import check_alike, leave_others, send_stage
 from a2tg_jax.results.stage_training import check_finished, train_stage
-from a2tg_jax.scene import Scene
-from a2tg_jax.training import Checkpoint, DivergedError, Session, StageResult, fit_stage, save_checkpoint
 from a2tg_jax.training.loop import IsStopped, Watch, never, unwatched
 from a2tg_jax.training.registry import system_to_dict
 from a2tg_jax.training.reports import Progress

@@ -5,17 +5,15 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
+from a2tg_jax import Checkpoint, Model, Scene, StageResult, System, load_checkpoint, load_model, save_checkpoint
 from a2tg_jax.base.archive import read_archive_header
 from a2tg_jax.base.machine import this_machine
 from a2tg_jax.base.text import counted
 from a2tg_jax.core.config_json import flatten_config
-from a2tg_jax.model import Model
-from a2tg_jax.model_file import FORMAT, load_model
+from a2tg_jax.model_file import FORMAT
 from a2tg_jax.results.folder import DAMAGED, StageFiles
 from a2tg_jax.results.plan import PlannedStage, is_same_so_far
 from a2tg_jax.results.run_processes import send_stage
-from a2tg_jax.scene import Scene
-from a2tg_jax.training import Checkpoint, StageResult, System, load_checkpoint, save_checkpoint
 from a2tg_jax.training.recorded_views import check_names
 from a2tg_jax.training.registry import system_from_dict
 

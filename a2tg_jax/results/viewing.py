@@ -18,12 +18,12 @@ from typing import Any
 import jax
 from PIL import Image
 
-from a2tg_jax.core.origin import BLACK, Color, Origin
+from a2tg_jax import Model, Origin, Scene, View, view_image
+from a2tg_jax.core.origin import BLACK, Color
 from a2tg_jax.io.web_scene import encode_web_scene
-from a2tg_jax.model import Model
 from a2tg_jax.results.images import to_uint8
 from a2tg_jax.results.model_source import Source
-from a2tg_jax.scene import Scene, View, origin_of_scene, view_image
+from a2tg_jax.scene import origin_of_scene
 from a2tg_jax.training.loop import IsStopped, StageRun
 from a2tg_jax.training.stage import BACKGROUNDS
 from a2tg_jax.web.page import (

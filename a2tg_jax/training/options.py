@@ -150,7 +150,7 @@ class System(NamedFields):
     """Options of exposures and poses."""
     more: tuple[int, ...] = ()
     """Iterations of further stages, in which the last one continues at the learning rates where it ended, without
-    growth. With --resume, they are added to a finished run."""
+    growth. A finished run that is resumed may get further ones."""
 
     name: ClassVar[str] = ""
     """Name on the command line."""

@@ -149,9 +149,8 @@ NUM_COMPARED = 16
 NEARLY_FLAT = 40.0
 """PSNR of one flat colour in dB, above which photographs do not show whether a model has learned."""
 ADVICE = (
-    "Look whether the points and cameras fit (cameras.png of a2tg sfm; in a2tg view RUN, photographs next to the "
-    "render from their cameras), then try fewer initial_gaussians, a lower initial_opacity or lower learning rates, "
-    "and refine_poses if poses may be wrong"
+    "Compare the photographs with renders from their cameras, and check that the points fit; then try fewer "
+    "initial_gaussians, a lower initial_opacity or lower learning rates, and refine_poses if poses may be wrong"
 )
 FLAT_BACKGROUNDS: dict[Background, float] = {"black": 0.0, "white": 1.0, "random": 0.5}
 
