@@ -25,9 +25,9 @@ from a2tg_jax.results.commands import quick_flags
 from a2tg_jax.results.forecast import (
     Bytes,
     RunForecast,
+    checked_forecast,
     doubts_about,
     forecast_run,
-    print_forecast,
     room_for_photographs,
     time_after,
 )
@@ -140,7 +140,7 @@ def test_splats_of_a_file_replace_the_first_stage():
     assert given.phases[other].model == own.phases[other].model
     assert given.disk_bytes > own.disk_bytes + 10**6 * 232
     with pytest.raises(ValueError, match=r"a2tg-textures: program.* change `init`, "):
-        print_forecast(SMALL, record, 10**9, num_given=10**6)
+        checked_forecast(SMALL, record, 10**9, num_given=10**6)
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
@@ -213,13 +213,12 @@ def test_a_system_names_its_own_limit(system, option):
         ("quick", (320, 213), None),
     ],
 )
-def test_the_forecast_of_a_long_run_has_quicker_flags(monkeypatch, capsys, tmp_path, preset, size, flags):
+def test_the_forecast_of_a_long_run_has_quicker_flags(monkeypatch, tmp_path, preset, size, flags):
     monkeypatch.setattr(machine, "memory_limit", lambda: 10**12)
     record = RunRecord(SceneSource("fox", downscale=2), "a2tg", a2tg.A2tg.preset(preset), preset=preset)
-    print_forecast(scene_of(*size), record, None, out=tmp_path)
-    assert (f"\nquicker on CPUs: {flags} takes minutes\n" in capsys.readouterr().out) == (flags is not None)
-    print_forecast(scene_of(*size), record, None)
-    assert "quicker" not in capsys.readouterr().out, "a resumed run keeps its options"
+    text = checked_forecast(scene_of(*size), record, None, out=tmp_path)
+    assert text.endswith(f"\nquicker on CPUs: {flags} takes minutes") == (flags is not None)
+    assert "quicker" not in checked_forecast(scene_of(*size), record, None), "a resumed run keeps its options"
 
 
 def test_the_downscale_of_quick_runs():
@@ -227,7 +226,7 @@ def test_the_downscale_of_quick_runs():
     assert {side: quick_flags(side).removeprefix("--preset quick") for side in downscales} == downscales
 
 
-def test_a_forecast_is_two_lines_of_text(capsys, monkeypatch):
+def test_a_forecast_is_two_lines_of_text(monkeypatch):
     parts = "a-gaussians: program 500 MB, photographs 1.00 GB, model 2.00 MB"
     text = forecast_with(program=0.5e9, photographs=1e9, model=2e6).text(8e9)
     assert text.splitlines() == [
@@ -235,8 +234,8 @@ def test_a_forecast_is_two_lines_of_text(capsys, monkeypatch):
         "disk: about 3.00 MB in the run folder",
     ]
     monkeypatch.setattr(machine, "memory_limit", lambda: 64 * 10**9)
-    print_forecast(SMALL, RunRecord(SceneSource("synthetic"), "a2tg", a2tg.A2tg.preset("smoke")), None)
-    assert "64.0 GB may be used\ndisk: about " in capsys.readouterr().out
+    text = checked_forecast(SMALL, RunRecord(SceneSource("synthetic"), "a2tg", a2tg.A2tg.preset("smoke")), None)
+    assert "64.0 GB may be used\ndisk: about " in text
 
 
 def test_on_an_accelerator_its_own_memory_counts(monkeypatch):
@@ -264,11 +263,11 @@ def test_the_state_must_fit_on_one_of_several_devices(monkeypatch):
         assert plain.whole_bytes == (3 + 3 / devices) * plain.model_bytes
     with pytest.raises(ValueError, match=r"the state of .* must fit on one device: .* change `densify.cap`"):
         found.check_one_device(2e8)
-    print_forecast(scene, record, None, 2)
+    checked_forecast(scene, record, None, 2)
     monkeypatch.setattr(RunForecast, "check_memory", lambda found, limit: None)
     with pytest.raises(ValueError, match="must fit on one device"):
-        print_forecast(scene, record, 2 * 10**8, 2)
-    print_forecast(scene, record, 2 * 10**8)
+        checked_forecast(scene, record, 2 * 10**8, 2)
+    checked_forecast(scene, record, 2 * 10**8)
 
 
 BEYOND_ANY_MACHINE = 10**9  # MB, 10^15 bytes

@@ -297,7 +297,7 @@ def test_a_file_in_place_of_the_first_stage_is_read_once_and_counted(tmp_path, m
     for module in (model_source, run_training):
         monkeypatch.setattr(module, "load_splats", read_and_noted)
     monkeypatch.setattr(SceneSource, "load", lambda self, room, **options: scene)
-    monkeypatch.setattr(run_training, "print_forecast", lambda *args: counts.append(args[4]))
+    monkeypatch.setattr(run_training, "checked_forecast", lambda *args: counts.append(args[4]))
     monkeypatch.setattr(run_training, "fit_stage", trained)
     save_ply(tmp_path / "a.ply", some_gaussians(40))
     system = A2tg(stage1_iterations=5, stage2_iterations=4)

@@ -181,13 +181,13 @@ def time_after(
     return rests
 
 
-def print_forecast(
+def checked_forecast(
     scene: Scene, record: RunRecord, max_memory: int | None, num_devices: int = 1, num_given: int | None = None,
     out: Path | None = None,
-) -> None:  # fmt: skip
-    """Print the forecast of a run, for at most `max_memory` bytes (None: what is available). `out` is the
-    folder of a new run, whose disk must have room for it; None for a resumed run. Raises ValueError if the run cannot
-    fit, naming the options to change. Other arguments as in `forecast_run`."""
+) -> str:  # fmt: skip
+    """Return the forecast of a run in lines of text, for at most `max_memory` bytes (None: what is available). `out` is
+    the folder of a new run, whose disk must have room for it; None for a resumed run. Raises ValueError if the run
+    cannot fit, naming the options to change. Other arguments as in `forecast_run`."""
     forecast = forecast_run(scene, record.plan, num_given, num_devices)
     limit = allowed_memory(max_memory, num_devices)
     forecast.check_memory(limit)
@@ -195,13 +195,14 @@ def print_forecast(
         forecast.check_one_device(allowed_memory(max_memory))
     if out is not None:
         forecast.check_disk(out)
-    print(forecast.text(limit), flush=True)
+    text = forecast.text(limit)
     side = _longest_side(scene)
     num_iterations = sum(stage.iterations for stage in record.options.all_stages())
     is_long = num_iterations > LONG or (record.preset == "quick" and side > QUICK_SIDE)
     has_quick = default_platform() == "cpu" and "quick" in type(record.options).presets()
     if out is not None and is_long and has_quick:
-        print(f"quicker on CPUs: {quick_flags(side, record.scene.downscale)} takes minutes", flush=True)
+        text += f"\nquicker on CPUs: {quick_flags(side, record.scene.downscale)} takes minutes"
+    return text
 
 
 def _longest_side(scene: Scene) -> int:

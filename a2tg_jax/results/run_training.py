@@ -19,7 +19,7 @@ from a2tg_jax.model_file import number_in_file
 from a2tg_jax.results.commands import file_command, resuming_command
 from a2tg_jax.results.compression import SUFFIX, CompressOptions, compress
 from a2tg_jax.results.folder import RunFolder, check_free, claimed, iteration_of, put_back_old, set_aside
-from a2tg_jax.results.forecast import doubts_about, print_forecast, room_for_photographs, time_after
+from a2tg_jax.results.forecast import checked_forecast, doubts_about, room_for_photographs, time_after
 from a2tg_jax.results.history import EventWriter, write_history
 from a2tg_jax.results.model_source import check_init, write_first_stage
 from a2tg_jax.results.output_paths import check_apart, check_output
@@ -102,7 +102,8 @@ def begin_run(record: RunRecord, out: Path, options: RunOptions) -> RunResult:
     doubts = doubts_about(scene, record)
     if doubts:
         options.confirm(doubts)
-    print_forecast(scene, record, options.max_memory, options.session.num_devices, num_given, out)
+    forecast = checked_forecast(scene, record, options.max_memory, options.session.num_devices, num_given, out)
+    options.on_note(forecast)
     run = RunFolder(out)
     with claimed(run):
         check_free(out, overwrite=options.overwrite)  # Another process may have been here meanwhile.
@@ -126,7 +127,7 @@ def resume_run(run: RunFolder, options: RunOptions) -> RunResult:
     if record.init is not None and not run.model(record.plan.main[0]).is_file():
         write_first_stage(run, record, load_splats(Path(record.init)), scene)
     num_given = _num_given(run, record)
-    print_forecast(scene, record, options.max_memory, options.session.num_devices, num_given)
+    options.on_note(checked_forecast(scene, record, options.max_memory, options.session.num_devices, num_given))
     return _train_and_measure(run, record, scene, options)
 
 
