@@ -12,7 +12,7 @@ from small_values import SH_C0, rotations
 
 import a2tg_jax as a2tg
 from a2tg_jax import Due, PlaceByError, View, adam_init, partition
-from a2tg_jax.densify.placing import OPACITY, gaussians_at_errors
+from a2tg_jax.densify.placing import gaussians_at_errors
 
 DEPTH = 4.0
 FOCAL = 20.0
@@ -72,7 +72,7 @@ def test_they_are_on_the_surface_at_the_wrong_pixels_and_of_their_colour():
     means = np.asarray(new.means)
     np.testing.assert_allclose(means[:, 2], DEPTH + TILT * means[:, 0], rtol=2e-3)
     np.testing.assert_allclose(new.scales, np.repeat(means[:, 2:] / FOCAL, 2, axis=1), rtol=1e-4)
-    np.testing.assert_allclose(new.opacities, OPACITY, rtol=1e-5)
+    np.testing.assert_allclose(new.opacities, 0.3, rtol=1e-5)
     # In the plane of the wall, whose normal is (TILT, 0, −1), in either direction.
     normals = rotations(new.quats)[:, :, 2]
     expected = np.array([TILT, 0, -1]) / np.hypot(TILT, 1)

@@ -13,7 +13,7 @@ from test_data_colmap import HEIGHT, WIDTH, write_scene
 import a2tg_jax as a2tg
 from a2tg_jax import BilateralGrid, Due, Geometry, LossConfig, adam_init
 from a2tg_jax.data.photo_reading import find_depths, read_depths
-from a2tg_jax.densify.pruning import are_near, shown_in
+from a2tg_jax.densify.pruning import shown_in
 from a2tg_jax.training.batches import stack_views
 from a2tg_jax.training.corrections import learned
 from a2tg_jax.training.start import initial_model
@@ -252,6 +252,18 @@ class TestDepthFiles:
         view = a2tg.load_scene(tmp_path, test_every=0).train[0]
         with pytest.raises(ValueError, match="of another aspect than its photograph"):
             view.depth.read()
+
+
+def are_near(points, views, near):
+    """[N] whether an event prunes the points [N, 3] as close to a camera, with others that no camera sees."""
+    unseen = np.full((2, 3), 1e3)
+    gaussians = a2tg.init_from_points(np.concatenate([points, unseen]), np.zeros((len(points) + 2, 3)))
+    numbered = dataclasses.replace(gaussians, logit_opacities=jnp.arange(gaussians.num, dtype=jnp.float32))
+    model = a2tg.Model(numbered)
+    moments = adam_init(a2tg.partition(model)[0])
+    change = a2tg.PruneFloaters(min_views=0, near=near).apply(Due(views=views), model, moments, ())
+    kept = np.asarray(change.model.live.gaussians.logit_opacities).astype(int)
+    return ~np.isin(np.arange(len(points)), kept)
 
 
 class TestFloaters:
