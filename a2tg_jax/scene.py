@@ -100,6 +100,17 @@ class Scene(NamedFields):
     """scene_scale: 1.1 × the largest distance of a camera, train or test, from their mean; cameras far from all others,
     of which loading warns, do not count."""
 
+    @property
+    def origin(self) -> Origin:
+        """Its cameras, training views first, and its world."""
+        views = [*self.train, *self.test]
+        return Origin.of_cameras(
+            [view.camera for view in views],
+            [view.name for view in views],
+            is_test=[False] * len(self.train) + [True] * len(self.test),
+            transform=self.transform,
+        )
+
     def __repr__(self) -> str:
         sizes = {view.picture.size for view in (*self.train, *self.test)}
         height, width = max(sizes, key=math.prod, default=(0, 0))
@@ -168,17 +179,6 @@ def check_view(view: View) -> None:
             )
     if view.mask is not None and not view.mask.num:
         raise ValueError(f"the mask of view {view.name} excludes every pixel: leave the view out or fix its mask")
-
-
-def origin_of_scene(scene: Scene) -> Origin:
-    """Return the cameras and the world of a scene, training views first."""
-    views = [*scene.train, *scene.test]
-    return Origin.of_cameras(
-        [view.camera for view in views],
-        [view.name for view in views],
-        is_test=[False] * len(scene.train) + [True] * len(scene.test),
-        transform=scene.transform,
-    )
 
 
 def kinds_of(views: Sequence[View]) -> list[tuple[int, int, int]]:

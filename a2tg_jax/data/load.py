@@ -29,7 +29,7 @@ from a2tg_jax.data.transforms import (
     load_transforms,
     transforms_in,
 )
-from a2tg_jax.host.command_words import as_argument
+from a2tg_jax.host.errors import as_argument
 
 HeldOut = Literal["test", "validation"]
 OTHER_PROGRAMS: tuple[Callable[[Path], list[Cameras]], ...] = (polycam, record3d, metashape, realityscan)

@@ -21,7 +21,7 @@ from a2tg_jax.base.text import PROGRAM, counted, first_names
 from a2tg_jax.data.decoding import software_of, upright_thumbnail
 from a2tg_jax.data.image_files import PHOTO_SUFFIXES, map_in_threads
 from a2tg_jax.data.other_runs import other_run
-from a2tg_jax.host.command_words import as_argument
+from a2tg_jax.host.errors import as_argument
 
 FOREIGN_SUFFIXES = (
     ".jxl", ".jp2", ".j2k", ".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".gif",

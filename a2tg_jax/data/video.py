@@ -16,7 +16,7 @@ from scipy.ndimage import laplace
 
 from a2tg_jax.base.regular_files import open_regular
 from a2tg_jax.data.decoding import MAX_PIXELS
-from a2tg_jax.host.command_words import as_argument
+from a2tg_jax.host.errors import as_argument
 from a2tg_jax.host.optional import optional
 from a2tg_jax.host.progress_bars import counting
 

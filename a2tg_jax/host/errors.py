@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import os
+import shlex
 import shutil
 from pathlib import Path
 
@@ -43,3 +44,9 @@ def error_text(error: Exception, less_memory: str) -> str | None:
             inodes = " or has no inodes left" if free > PLENTY else ""
             details = f"{inodes}, {free / 1e6:.1f} MB are free"
     return f"{error.filename}: the disk is full{details}: make room, or write to another disk"
+
+
+def as_argument(path: Path) -> str:
+    """Return a path quoted for a shell, relative to the current folder if it is inside."""
+    here = Path.cwd()
+    return shlex.quote(str(path.relative_to(here) if path.is_relative_to(here) else path))

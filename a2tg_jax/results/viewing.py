@@ -23,7 +23,6 @@ from a2tg_jax.core.origin import BLACK, Color
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.results.images import to_uint8
 from a2tg_jax.results.model_source import Source
-from a2tg_jax.scene import origin_of_scene
 from a2tg_jax.training.loop import IsStopped, StageRun
 from a2tg_jax.training.stage import BACKGROUNDS
 from a2tg_jax.web.page import (
@@ -129,7 +128,7 @@ class LiveView:
         model = dataclasses.replace(
             jax.device_get(run.state.model),
             background=BACKGROUNDS[run.system.background],
-            origin=origin_of_scene(self._scene),
+            origin=self._scene.origin,
         )
         self._due = math.inf
         self._encoder = threading.Thread(target=self._encode, args=(model, began), daemon=True)
@@ -144,7 +143,7 @@ class LiveView:
             f"/{STATUS_NAME}": Route("application/json", self._status_json),
             "/pause": Route("application/json", self._status_json, act=self._paused.set),
             "/resume": Route("application/json", self._status_json, act=self._paused.clear),
-            **CameraPhotographs(origin_of_scene(self._scene), lambda: self._scene).routes,
+            **CameraPhotographs(self._scene.origin, lambda: self._scene).routes,
         }
 
     def _status_json(self) -> bytes:

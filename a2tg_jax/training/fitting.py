@@ -15,7 +15,7 @@ from a2tg_jax.core.checks import check_kind, check_untraced, kind_of
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.model import Model
-from a2tg_jax.scene import Scene, check_scene, origin_of_scene
+from a2tg_jax.scene import Scene, check_scene
 from a2tg_jax.training.checkpoint import Checkpoint, History
 from a2tg_jax.training.corrections import corrected_origin
 from a2tg_jax.training.cost import check_rows_fit
@@ -295,7 +295,7 @@ def fit_stage(
 
 def _result_of(run: StageRun, scene: Scene, *, is_last: bool) -> StageResult:
     """Return the result of a trained stage."""
-    origin = corrected_origin(origin_of_scene(scene), run.stage.corrections, run.whole_state.corrections)
+    origin = corrected_origin(scene.origin, run.stage.corrections, run.whole_state.corrections)
     model = dataclasses.replace(run.model, background=BACKGROUNDS[run.system.background], origin=origin)
     if is_last:
         warn_of_budget(run.system, model)
