@@ -15,6 +15,7 @@ from toy_system import Rings
 
 import a2tg_jax as a2tg
 from a2tg_jax import adam_init, combine, partition
+from a2tg_jax.training import loop
 from a2tg_jax.training.cost import forecast_stages
 from a2tg_jax.training.reports import StageEffects
 from a2tg_jax.training.step import initial_state, jitted_step
@@ -164,6 +165,27 @@ class Late(a2tg.StepEvent):
 
     def apply(self, now, model, moments, state):
         return a2tg.Change(model, moments, state)
+
+
+@a2tg.pytree
+class Summing(a2tg.StepEvent):
+    """Adds up the iterations at which it happens, and how often it says that it still does."""
+
+    def times(self, num_iterations):
+        return 2, 5, 6
+
+    def init(self, model):
+        return jnp.zeros(2, jnp.int32)
+
+    def apply(self, now, model, moments, state):
+        return a2tg.Change(model, moments, state + jnp.stack([now.iteration, now.num_left]))
+
+
+@pytest.mark.parametrize("is_decided_by_host", [False, True])
+def test_events_in_the_step_happen_at_any_times(scene, monkeypatch, is_decided_by_host):
+    monkeypatch.setattr(loop, "are_events_decided_by_host", lambda state: is_decided_by_host)
+    state = fitted(scene, Summing(), iterations=7).checkpoint.state
+    np.testing.assert_array_equal(state.events[0], [2 + 5 + 6, 3 + 2 + 1])
 
 
 @a2tg.pytree

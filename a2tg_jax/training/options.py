@@ -254,8 +254,7 @@ class System(NamedFields):
         if not self.more:
             return stages
         last = stages[-1]
-        events = tuple(last.events[index] for index in last.lasting())
-        further = dataclasses.replace(last, events=events, raises_sh_degree=False, continues=True)
+        further = dataclasses.replace(last, events=last.lasting_events, raises_sh_degree=False, continues=True)
         names = ["more", *(f"more-{number}" for number in range(2, len(self.more) + 1))]
         pairs = zip(names, self.more, strict=True)
         return (*stages, *(dataclasses.replace(further, name=name, iterations=length) for name, length in pairs))

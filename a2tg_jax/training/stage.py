@@ -250,10 +250,11 @@ class Stage(NamedFields):
         factor = 1 - (1 - COOLED) * progress
         return jax.tree.map(lambda rate: rate * factor.astype(jnp.result_type(rate, float)), rates)
 
-    def lasting(self) -> tuple[int, ...]:
-        """Return the indices of the events that happen after every iteration, such as noise (host)."""
-        all_iterations = every_iteration(self.iterations)
-        return tuple(index for index, times in enumerate(self.times) if times == all_iterations)
+    @property
+    def lasting_events(self) -> tuple[Event, ...]:
+        """Events that happen after every iteration, such as noise (host)."""
+        all_times = every_iteration(self.iterations)
+        return tuple(event for event, times in zip(self.events, self.times, strict=True) if times == all_times)
 
     def clock(self, iteration: int, largest_loss: float = math.inf) -> "Clock":
         """Return the schedule for the step of an iteration, which is not taken beyond a loss (host)."""

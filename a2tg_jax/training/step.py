@@ -209,7 +209,9 @@ def attempt(
     else:
         backgrounds = jnp.full((len(batch.viewmats), 3), 1.0 if settings.background == "white" else 0.0, dtype)
     correction_rows = tuple(correction.rows[rows] for correction in state.corrections)
-    is_gathering = any(s is not None and e.statistic for e, s in zip(stage.events, state.events, strict=True))
+    is_gathering = False
+    for event, event_state in zip(stage.events, state.events, strict=True):
+        is_gathering |= event_state is not None and event.statistic is not None
     drawn = batch_gradients(settings, stage, clock, model, batch, backgrounds, iteration, correction_rows, is_gathering)
     of_gaussians, of_appearance, of_corrections = drawn.grads
     # Gradients of corrections belong to one view each.
@@ -229,15 +231,14 @@ def attempt(
         cameras = jax.vmap(functools.partial(corrected_camera, stage.corrections))(correction_rows, cameras)
     # ∂L/∂colour: the colour is linear in the first coefficient, with the factor SH_C0.
     colors = of_gaussians.sh[:, :, 0] / SH_C0
-    statistic = jnp.zeros_like(colors), jnp.zeros(colors.shape[:2], bool)
+    seen = Seen(cameras, jnp.zeros_like(colors), jnp.zeros(colors.shape[:2], bool), colors)
     if drawn.statistic is not None and stage.statistic is not None:
-        statistic = read_probe(drawn.statistic, stage.statistic, width, height)
+        gradients, is_visible = read_probe(drawn.statistic, stage.statistic, width, height)
+        seen = seen._replace(gradients=gradients, is_visible=is_visible)
     at = clock.scheduled(iteration)
     length = jnp.asarray(clock.num_iterations)
     now = Now(keys[1:], at, stage.cooled(rate, progress), length, scene_scale)
-    change, events = _events(
-        settings.due, stage, clock, now, Seen(cameras, *statistic, colors), model, moments, state.events
-    )
+    change, events = _events(settings.due, stage, clock, now, seen, model, moments, state.events)
     corrections = tuple(
         updated(correction, correction_state, rows, grad, progress)  # type: ignore[arg-type]
         for correction, correction_state, grad in zip(stage.corrections, state.corrections, of_corrections, strict=True)
@@ -250,12 +251,18 @@ def attempt(
         ids_after_adam = {id(leaf) for leaf in jax.tree.leaves(step.params)}
         made = [leaf for leaf in jax.tree.leaves(made) if id(leaf) not in ids_after_adam]
     rows_after = [correction.rows for correction in corrections]
-    checked = jax.tree.leaves((drawn.loss, grads, of_corrections, made, rows_after))
+    is_finite = _are_finite(jax.tree.leaves((drawn.loss, grads, of_corrections, made, rows_after)))
+    return Attempt(drawn, (*grads, of_corrections), after, change.info, is_finite)
+
+
+def _are_finite(leaves: Sequence[Array]) -> Array:
+    """Return whether all numbers of some arrays are finite."""
     # Row by row first, then one reduction of all rows. Without the barrier XLA would reduce each leaf separately to one
     # flag, which costs a GPU two launches a leaf.
-    are_finite = [jnp.all(jnp.isfinite(leaf), axis=tuple(range(1, leaf.ndim))) for leaf in map(jnp.atleast_1d, checked)]
-    is_finite = jnp.all(jax.lax.optimization_barrier(jnp.concatenate(are_finite)))
-    return Attempt(drawn, (*grads, of_corrections), after, change.info, is_finite)
+    are_finite = []
+    for leaf in map(jnp.atleast_1d, leaves):
+        are_finite.append(jnp.all(jnp.isfinite(leaf), axis=tuple(range(1, leaf.ndim))))
+    return jnp.all(jax.lax.optimization_barrier(jnp.concatenate(are_finite)))
 
 
 def batch_gradients(
