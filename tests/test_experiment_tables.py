@@ -90,7 +90,7 @@ def test_times_of_the_efficiency_page_are_measured_once(tmp_path, monkeypatch):
         a2tg.save_model(path, small_models.some_model())
         lab.records[job.key] = record(mb=0.5)
 
-    def fit(scene, system, index, start, progress):
+    def fit(scene, system, index, start):
         fitted.append((index, system.stages()[index].iterations, start.num))
         pace = 10.0 + 5 * index
         history = SimpleNamespace(seconds=np.arange(3) * pace, iteration=1000 * np.arange(3))
