@@ -19,7 +19,6 @@ from test_shared import Own
 
 import a2tg_jax as a2tg
 from a2tg_jax import Change, Gaussians2dMcmc, HostEvent, Session, SplitByGradient, StepEvent, fit_stage
-from a2tg_jax.core.config_json import changed_config
 from a2tg_jax.parallel import whole
 from a2tg_jax.training import loop
 from a2tg_jax.training.batches import PhotoStore
@@ -70,9 +69,7 @@ def behind_lenses(found):
 
 
 def system(kind, **options):
-    return changed_config(
-        kind.preset("smoke"), {"initial_gaussians": ROWS, "seed": 3, "batch_size": 4, **options}, "here"
-    )
+    return kind.preset("smoke", **{"initial_gaussians": ROWS, "seed": 3, "batch_size": 4, **options})
 
 
 def devices(count):

@@ -29,7 +29,7 @@ from a2tg_jax import (
 )
 from a2tg_jax.cli import main as cli
 from a2tg_jax.core.budget import bytes_per_gaussian, number_to_reach
-from a2tg_jax.core.config_json import changed_config, config_from_dict, config_to_dict
+from a2tg_jax.core.config_json import config_from_dict, config_to_dict
 from a2tg_jax.training import SYSTEMS
 from a2tg_jax.training.fitting import warn_of_budget
 from a2tg_jax.training.registry import system_from_dict, system_to_dict
@@ -51,9 +51,9 @@ def scene():
 
 
 def smoke(name: str, **changes):
-    preset = type(a2tg.find_system(name)).preset("smoke")
-    textured = {"stage2_iterations": 6} if preset.stage2_iterations else {}
-    return changed_config(preset, {**SHORT, **textured, **changes}, "test")
+    kind = type(a2tg.find_system(name))
+    textured = {"stage2_iterations": 6} if kind.preset("smoke").stage2_iterations else {}
+    return kind.preset("smoke", **{**SHORT, **textured, **changes})
 
 
 def filling(system: a2tg.System) -> FillingMcmc | FillingDensity:
@@ -94,7 +94,7 @@ def test_a_budget_is_one_value_however_it_comes(name, tmp_path):
     assert cli.parsed("train", ["synthetic", *run, "--memory-budget", "1.5MB"]).record.options == wanted
     for number in ('"1.5MB"', "1.5", '"1500 kB"'):
         table = tomllib.loads(f"memory_budget = {number}")
-        assert changed_config(kind(), table, "file") == wanted
+        assert kind.preset("paper", **table) == wanted
     assert config_from_dict(kind, json.loads(json.dumps(config_to_dict(wanted)))) == wanted
     assert system_from_dict(system_to_dict(wanted), "file") == wanted
 
@@ -308,7 +308,7 @@ def test_budgets_that_the_points_of_a_scene_cannot_fill_are_refused(scene, name,
 
 def test_a_budget_of_textures_has_room_for_growth_only_where_there_is_some(scene):
     changes = {"texture": {"select": "budget", "budget_mb": 0.03}, "initial_gaussians": None}
-    system = changed_config(a2tg.A2tg.preset("smoke"), changes, "test")
+    system = a2tg.A2tg.preset("smoke", **changes)
     with pytest.raises(ValueError, match=r"0\.03, but \d+ Gaussians .*: raise it, or lower densify\.cap$"):
         check_start(scene, system)
     most = 30_000 // bytes_per_gaussian(system.sh_degree, 4)
@@ -329,7 +329,8 @@ def test_a_budget_of_textures_is_checked_before_the_first_stage(scene, cap):
             start(scene, system)
     with pytest.raises(ValueError, match=r"but 120 Gaussians .*: raise it$"):
         system.check_given_number(120)
-    check_start(scene, changed_config(system, {"texture": {"budget_mb": 0.0298}}, "test"))
+    smaller = dataclasses.replace(system.texture, budget_mb=0.0298)
+    check_start(scene, dataclasses.replace(system, texture=smaller))
 
 
 def test_textures_that_begin_empty_take_nothing_of_a_budget(scene):

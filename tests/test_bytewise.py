@@ -1,5 +1,7 @@
 """The system that spends bytes where they pay: what its options lead to, and which it refuses before training."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,7 +28,6 @@ from a2tg_jax import (
     save_checkpoint,
 )
 from a2tg_jax.core.budget import bytes_of, event_budget
-from a2tg_jax.core.config_json import changed_config
 from a2tg_jax.results.record import compared_system
 from a2tg_jax.training.start import initial_model, padded
 from a2tg_jax.training.step import jitted_step
@@ -39,7 +40,7 @@ def scene():
 
 def smoke(**changes) -> Bytewise:
     short = {"stage1_iterations": 60, "stage2_iterations": 20, "memory_budget": "40kB", "initial_gaussians": None}
-    return changed_config(Bytewise.preset("smoke"), {**short, **changes}, "test")
+    return Bytewise.preset("smoke", **{**short, **changes})
 
 
 SHARES = {"view_dependence_share": 0.1, "texture_share": 0.05}
@@ -139,7 +140,7 @@ def test_shapes_of_kernels_are_trained_in_both_stages_and_counted(scene, tmp_pat
     first = a2tg.fit_stage(scene, system, 0, progress=False).model
     before = np.asarray(first.appearance.shapes)
     assert before.std() > 0.02 and before.max() > 0 > before.min()
-    resting = a2tg.fit_stage(scene, changed_config(system, {"kernel_rate": 1e-9}, "test"), 1, first, progress=False)
+    resting = a2tg.fit_stage(scene, dataclasses.replace(system, kernel_rate=1e-9), 1, first, progress=False)
     after = resting.model.appearance.shapes
     np.testing.assert_allclose(after, before, atol=1e-6, err_msg="the second stage continues the first one's shapes")
     result = a2tg.fit_stage(scene, system, 1, first, progress=False)

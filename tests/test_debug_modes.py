@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import a2tg_jax as a2tg
-from a2tg_jax.core.config_json import changed_config
 
 WITHOUT_JIT = jax.disable_jit
 CHECKS_FOR_NAN = functools.partial(jax.debug_nans, True)
@@ -31,7 +30,7 @@ def test_a_system_trains(mode, name, cap, iterations):
     scene = a2tg.synthetic_scene(num_views=4, width=16, height=12, num_points=30)
     changes = {"stage1_iterations": iterations, "stage2_iterations": 1, "initial_gaussians": 20}
     changes |= {"densify": {"cap": cap}, "tile_size": 16}
-    system = changed_config(a2tg.find_system(name), changes, "test")
+    system = a2tg.find_system(name).preset("paper", **changes)
     with mode():
         model = a2tg.fit(scene, system, progress=False).model
     assert model.num != 20

@@ -480,7 +480,7 @@ CALLS = {
     "fitted(points=np.zeros((0, 3)), colors=np.zeros((0, 3)))": "scene.points … two points … 0",
     "fitted(colors=np.zeros((2, 3)))": "scene.colors … [9, 3] … [2, 3]",
     # Systems and training
-    "fit('synthetic', A2tg())": "scene … Scene … synthetic_scene()",
+    "fit('synthetic', A2tg())": "scene … Scene … load_scene('synthetic')",
     "fit(Path('fox'), A2tg())": "scene … Scene … load_scene",
     "fit(SCENE, 'a2tg')": "system … a name … find_system('a2tg')",
     "fit(SCENE, A2tg)": "system … System … the class A2tg … A2tg()",

@@ -165,7 +165,7 @@ def test_text_is_utf8_on_every_system():
     """Except what Linux, and what the package's metadata, say of themselves."""
     modules = [path for path in (ROOT / "a2tg_jax").rglob("*.py") if path.stem not in ("machine", "source_commit")]
     assert len(modules) > 100 and not [line for path in modules for line in without_encoding(path)]
-    assert list(without_encoding(ROOT / "a2tg_jax" / "host" / "machine.py"))
+    assert list(without_encoding(ROOT / "a2tg_jax" / "base" / "machine.py"))
 
 
 def test_files_of_the_project_can_lie_on_every_system():

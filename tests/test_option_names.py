@@ -8,7 +8,7 @@ from toy_system import Shrink, Toy
 
 import a2tg_jax as a2tg
 from a2tg_jax import HostEvent, StepEvent, find_system
-from a2tg_jax.core.config_json import changed_config, flatten_config
+from a2tg_jax.core.config_json import flatten_config
 from a2tg_jax.training import SYSTEMS
 
 WITH_AND_WITHOUT = pytest.mark.parametrize("budget", [None, "9MB"])
@@ -44,7 +44,7 @@ def test_every_group_checks_its_own_numbers(name):
         group, _, field = path.partition(".")
         if isinstance(getattr(system, group), StepEvent | HostEvent) and type(value) in (int, float):
             with pytest.raises(ValueError, match=rf"^{re.escape(path)} must "):
-                changed_config(system, {group: {field: type(value)(-1)}}, "test").check()
+                system.preset("paper", **{group: {field: type(value)(-1)}}).check()
 
 
 @pytest.mark.parametrize(
@@ -52,7 +52,7 @@ def test_every_group_checks_its_own_numbers(name):
 )
 def test_the_same_mistake_is_named_by_its_path(name, option):
     group, _, field = option.partition(".")
-    system = changed_config(find_system(name), {group: {field: [0.5, 0.2]}}, "test")
+    system = find_system(name).preset("paper", **{group: {field: [0.5, 0.2]}})
     message = rf"^{re.escape(option)} must be ascending fractions between 0 and 1; got \(0.5, 0.2\)$"
     with pytest.raises(ValueError, match=message):
         system.check()

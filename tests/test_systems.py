@@ -15,7 +15,6 @@ from toy_system import Toy
 
 import a2tg_jax as a2tg
 from a2tg_jax import adam_init, combine, fit_stage, partition
-from a2tg_jax.core.config_json import changed_config
 from a2tg_jax.training import SYSTEMS
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.loop import StageRun
@@ -60,7 +59,7 @@ def tiny(name: str, **changes):
         changes["densify"] = {"cap": 600, **changes.get("densify", {})}
     if hasattr(system, "stage2_iterations"):
         changes = {"stage2_iterations": 12, **changes}
-    return changed_config(system, {**TINY, **changes}, "test")
+    return system.preset("paper", **{**TINY, **changes})
 
 
 def assert_same(a, b):
@@ -273,7 +272,7 @@ def test_a_training_without_gaussians_left_says_what_to_change(scene, name, reas
 def test_options_as_values_of_files_and_back(name):
     system = type(a2tg.find_system(name)).preset("smoke")
     assert system_from_dict(system_to_dict(system), "file") == system
-    assert changed_config(a2tg.find_system(name), own_options(system, type(system)()), "file") == system
+    assert system.preset("paper", **own_options(system, type(system)())) == system
 
 
 def test_a_file_imports_nothing():
