@@ -169,7 +169,7 @@ def fit(
       >>> result.history.iteration
       array([10, 20])
     """
-    _check_arguments(scene, system, start, resume, checkpoint_every)
+    _check_arguments(scene, system, start, resume, checkpoint_every, progress)
     stages = system.all_stages()
     first = 0
     if resume is not None:
@@ -199,8 +199,9 @@ def fit(
 
 
 def _check_arguments(
-    scene: Scene, system: System, start: Model | None, resume: Checkpoint | None, checkpoint_every: int | None
-) -> None:
+    scene: Scene, system: System, start: Model | None, resume: Checkpoint | None, checkpoint_every: int | None,
+    progress: object,
+) -> None:  # fmt: skip
     """Raise ValueError unless the arguments are of their classes, and the training views and the options are valid."""
     check_untraced("fit")
     is_path = str, os.PathLike
@@ -229,6 +230,8 @@ def _check_arguments(
         check_kind("start", start, Model, hint)
     if checkpoint_every is not None and checkpoint_every < 1:
         raise ValueError(f"checkpoint_every must be at least 1; got {checkpoint_every}")
+    if progress is True:
+        raise ValueError("progress must be None, or a class such as a2tg_jax.ProgressBar; got True")
     system.check()
     check_scene(scene)
 
@@ -279,7 +282,7 @@ def fit_stage(
       >>> len(result.history.psnr)
       2
     """
-    _check_arguments(scene, system, start, resume, checkpoint_every)
+    _check_arguments(scene, system, start, resume, checkpoint_every, progress)
     stages = system.all_stages()
     if not 0 <= index < len(stages):
         raise ValueError(f"index must be in 0..{len(stages) - 1}, one of the stages; got {index}")
