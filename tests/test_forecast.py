@@ -112,9 +112,12 @@ def test_a_stage_refuses_what_a_later_one_cannot_hold(monkeypatch):
     monkeypatch.setattr(cost, "used_memory", lambda num_devices: 0)
     train = functools.partial(a2tg.fit_stage, scene_of(48, 32), small_system(), 0)
     progress = Progress(after=RestOfRun(model_bytes=10**10))
-    with pytest.raises(ValueError, match=r"and a later stage about 60\.0 GB; 50\.0 GB may be used"):
+    with pytest.raises(ValueError, match=r"and what follows the stage about 60\.0 GB; 50\.0 GB may be used"):
         train(progress=progress, max_memory=5 * 10**10)
     assert train(progress=progress, max_memory=7 * 10**10).model.num > 1
+    progress = Progress(after=RestOfRun(programs=10**6))
+    with pytest.raises(ValueError, match=r"and what follows the stage about 50,000 GB; 50\.0 GB may be used"):
+        train(progress=progress, max_memory=5 * 10**10)
 
 
 def test_rows_and_bytes_are_those_that_training_reaches():

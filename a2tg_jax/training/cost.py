@@ -14,10 +14,13 @@ from a2tg_jax.events import HostEvent
 from a2tg_jax.scene import Scene, View, ray_bytes
 from a2tg_jax.training.batches import plan_batches, view_bytes
 from a2tg_jax.training.options import System
+from a2tg_jax.training.reports import RestOfRun
 from a2tg_jax.training.start import initial_number, rows_needed
 
 STATES = 3
 """Parameters and the two moments of Adam."""
+FURTHER_PROGRAM = 50 * 10**6
+"""Bytes that a process keeps for each further program on a CPU, measured: 25 to 110 MB."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,14 +121,19 @@ def check_rows_fit(
 
 
 def check_step_fits(
-    step: jax.stages.Compiled, growth: float, system: System, devices: Devices, max_memory: int | None = None
+    step: jax.stages.Compiled,
+    model_bytes: float,
+    after: RestOfRun,
+    system: System,
+    devices: Devices,
+    max_memory: int | None = None,
 ) -> float:
     """Return the bytes of memory in use while a compiled step runs, before it runs for the first time (host).
 
     Args:
       step: the step, of which XLA says how much it allocates.
-      growth: bytes by which the model of a later stage is larger. While a step runs there are parameters and moments of
-        before and after it.
+      model_bytes: bytes of its model.
+      after: stages that follow.
       system: whose limits a message names.
       devices: devices that run the step.
       max_memory: as for `check_rows_fit`.
@@ -137,15 +145,18 @@ def check_step_fits(
     # Some platforms do not say.
     new = 0 if said is None else said.temp_size_in_bytes + said.output_size_in_bytes - said.alias_size_in_bytes
     needed = used_memory(devices.each) + devices.each * new
-    largest = needed + 2 * STATES * growth
+    # While a step runs there are parameters and moments of before and after it.
+    later = needed + 2 * STATES * max(0, after.model_bytes - model_bytes)
+    if default_platform() == "cpu":
+        later += FURTHER_PROGRAM * after.programs
     limit = allowed_memory(max_memory, devices.each)
-    if devices.processes == 1 and largest > limit:
-        later = f", and a later stage about {in_bytes(largest)}" if growth else ""
+    if devices.processes == 1 and later > limit:
+        and_later = f", and what follows the stage about {in_bytes(later)}" if later > needed else ""
         names = ", ".join((*system.limits(), "batch_size or sh_degree"))
         raise ValueError(
             f"XLA reports that a step needs {in_bytes(new)} of memory, {in_bytes(needed)} with all that is in use"
-            f"{later}; {in_bytes(limit)} may be used: lower {names}, take smaller photographs (downscale), or allow "
-            "more with max_memory"
+            f"{and_later}; {in_bytes(limit)} may be used: lower {names}, take smaller photographs (downscale), or "
+            "allow more with max_memory"
         )
     return needed
 

@@ -33,7 +33,7 @@ from a2tg_jax.training.cost import check_step_fits
 from a2tg_jax.training.divergence import DivergedError, largest_loss, what_diverged
 from a2tg_jax.training.options import System
 from a2tg_jax.training.recorded_views import RecordedViews
-from a2tg_jax.training.reports import Display, LearningCheck, Pace, Progress, StageEffects
+from a2tg_jax.training.reports import Display, LearningCheck, Pace, Progress, RestOfRun, StageEffects
 from a2tg_jax.training.returned import calling, checked_change
 from a2tg_jax.training.stage import BACKGROUNDS
 from a2tg_jax.training.start import state_of_checkpoint, state_of_start
@@ -191,7 +191,7 @@ class StageRun:
         self.memory: float | None = None
         """Bytes in use while a step runs; None: no step is compiled yet."""
         self._max_memory = max_memory
-        self._later_bytes = 0.0
+        self._after = RestOfRun()
         self.started = time.perf_counter()
         self.time_left: datetime.timedelta | None = None
         """Remaining time of the run, about; None at the beginning."""
@@ -236,7 +236,7 @@ class StageRun:
         """Run the stage to its end, then release its photographs. If it is stopped, write a last checkpoint and raise
         `Interrupted`.
         """
-        self._later_bytes = progress.after.model_bytes
+        self._after = progress.after
         iteration = int(self.state.iteration)
         end = self.stage.iterations
         self.effects.warn_of_never()
@@ -337,9 +337,8 @@ class StageRun:
         if a later stage of the run probably cannot."""
         # The call that follows finds this program, in JAX's cache of this process.
         step = jitted_step().lower(*arguments).compile()
-        own = sum(leaf.nbytes for leaf in jax.tree.leaves(self.state.model))
-        growth = max(0.0, self._later_bytes - own)
-        return check_step_fits(step, growth, self.system, self.session.devices, self._max_memory)
+        model_bytes = sum(leaf.nbytes for leaf in jax.tree.leaves(self.state.model))
+        return check_step_fits(step, model_bytes, self._after, self.system, self.session.devices, self._max_memory)
 
     def arguments(self, iteration: int) -> tuple[Any, ...]:
         """Return the arguments of the step of an iteration."""
