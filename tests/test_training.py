@@ -290,7 +290,9 @@ def test_wrong_arguments_of_fit_are_refused(scene, trained):
         fit(scene, Gaussians2dMcmc(stage1_iterations=4), resume=checkpoint, progress=False)
     with pytest.raises(ValueError, match="checkpoint_every must be at least 1; got 0"):
         fit(scene, CONFIG, checkpoint_every=0, progress=False)
-    with pytest.raises(ValueError, match=r"^progress must be None, or a class such as a2tg_jax\.ProgressBar; got True$"):
+    with pytest.raises(
+        ValueError, match=r"^progress must be None, or a class such as a2tg_jax\.ProgressBar; got True$"
+    ):
         fit(scene, CONFIG, progress=True)
     with pytest.raises(ValueError, match=r"index must be in 0\.\.1"):
         fit_stage(scene, CONFIG, 2, progress=False)
