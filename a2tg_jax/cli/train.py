@@ -159,7 +159,7 @@ class Train:
     view: bool = False
     """Show the training in a browser, where you can pause it."""
     max_memory: Annotated[str | None, defaulting_to("all available", "SIZE")] = None
-    """Memory limit of the process and of the GPU, such as 8GB or 800MB. Training does not start if it needs more.
+    """Memory limit of the process and of the GPU, such as 8GB or 800MB. A stage is not trained if it needs more.
     Photographs beyond a quarter of it stay on disk. For a limit on the model, use --memory-budget."""
     devices: Annotated[str, arg(metavar="N")] = "1"
     """Number of GPUs per process that train the scene together, or all. Each draws whole views: without --batch-size,
