@@ -47,9 +47,11 @@ def table_of_times(lab: Lab, grid: Grid) -> str:
     kept = read_kept(path)
     for result in tables.results_of(grid, lab.records):
         key = result.run.job.key
-        if key not in kept and not lab.args.tables_only and (model := lab.model(result)) is not None:
-            kept[key] = _times(lab, result, model)
-            write_json(path, kept)
+        if key not in kept and not lab.args.tables_only:
+            model = lab.model(result)
+            if model is not None:
+                kept[key] = _times(lab, result, model)
+                write_json(path, kept)
         if key in kept:
             rows.append(_row(result, kept[key]))
     header = ["scene", "method", "Gaussians", "MB", "frames/s", "ms a frame", "ms a step, stages 1, 2", "training, min"]

@@ -35,8 +35,10 @@ SIZE_OF_ENDPOINT = 100_000, 3
 """Gaussians and degree of the rows of E4 that the page shows; others are in NOTEBOOK.md."""
 LEAST_SCENES = 3
 """Smallest number of scenes of a row on the page: an interval of two says nothing."""
-QUICK, QUICK_SIZE = "in `quick`", 60
-"""Name of E1's place in the table, and its bytes per pixel; other sizes are in NOTEBOOK.md."""
+QUICK = "in `quick`"
+"""Name of E1's place in the table."""
+QUICK_SIZE = 60
+"""Its bytes per pixel; other sizes are in NOTEBOOK.md."""
 DENSE = "dense"
 FEW = "few views"
 BEST = "Best plain method"

@@ -16,8 +16,10 @@ from lab.tables import markdown
 import a2tg_jax as a2tg
 from a2tg_jax.data.synthetic import exact_points
 
-SPACING, THRESHOLD = 0.01, 0.02
-"""Distance of points on the built-in scene, and largest distance that its F-score counts, in its metres."""
+SPACING = 0.01
+"""Distance of points on the built-in scene, in its metres."""
+THRESHOLD = 0.02
+"""Largest distance that the F-score counts, in metres."""
 WEIGHTS: Mapping[str, dict[str, float]] = {
     "no losses": {},
     "normals 0.05": {"normal_weight": 0.05},

@@ -12,6 +12,7 @@ import stat
 import subprocess
 import sys
 import tomllib
+import warnings
 from types import SimpleNamespace
 
 import jax
@@ -456,9 +457,11 @@ def test_export_and_what_view_would_serve(run, tmp_path, monkeypatch, capsys):
 
 def test_export_for_other_programs(run, tmp_path, capsys):
     """Flat 3D Gaussians, which this program's reader takes for what they were; so is the run's own point cloud."""
-    with pytest.warns(UserWarning, match="new does not exist and will be made"):
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
         assert cli.main(["convert", str(run.path), str(tmp_path / "new" / "fox.ply")]) == 0
-    printed = capsys.readouterr().out
+    printed, error = capsys.readouterr()
+    assert f"a2tg: warning: {tmp_path / 'new'} does not exist and will be made\n" in error
     assert "fox.ply: 60 Gaussians" in printed
     assert "not kept by this format: textures (bake turns them into plain splats)" in printed
     for path in (tmp_path / "new" / "fox.ply", run.point_cloud):

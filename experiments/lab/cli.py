@@ -271,7 +271,8 @@ def run_experiments(experiments: Sequence[Experiment], args: argparse.Namespace)
         lab = Lab(args)
         names = list(dict.fromkeys(name for experiment in experiments for name in experiment.grids))
         grids = {name: lab.grid(name) for name in names}
-        if old := versions.as_text(lab.records_of(list(grids.values()))):
+        old = versions.as_text(lab.records_of(list(grids.values())))
+        if old:
             print(f"Runs from before: {old}. --renew trains them again.", flush=True)
         if args.plan:
             check_systems(list(grids.values()), lab.records)

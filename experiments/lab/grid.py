@@ -136,7 +136,8 @@ class Grid:
             for method in self.at_equal_time if wanted else ():
                 if not method.is_chosen_for(cell.scene):
                     continue
-                if taken := seconds_of(self._job(method, cell), records):
+                taken = seconds_of(self._job(method, cell), records)
+                if taken:
                     first, second = (max(1, round(count * wanted / taken)) for count in cell.iterations)
                     longer = dataclasses.replace(cell, iterations=(first, second))
                     yield Run(method, cell, "time", self._job(method, longer))

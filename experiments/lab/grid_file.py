@@ -179,7 +179,8 @@ def part_as(kind: type[TableT], table: Any, where: str) -> TableT:
     values = {name: value for name, value in vars(part).items() if value is not None}
     for name in LEAST.keys() & values.keys():
         _check_numbers(values[name], LEAST[name], f"{where}.{name}")
-    if len(given := [name for name in SIZES if name in values]) > 1:
+    given = [name for name in SIZES if name in values]
+    if len(given) > 1:
         raise ValueError(f"{where} has {' and '.join(given)}: leave one out")
     return part
 

@@ -39,8 +39,10 @@ from lab.scenes import few_views, from_random_points
 from lab.timing import TrainingTime
 from lab.versions import is_from_before
 
-TEST, VALIDATION = "test", "validation"
-"""Views that are held out: those of the scene, or every eighth of its training views."""
+TEST = "test"
+"""The test views of the scene are held out."""
+VALIDATION = "validation"
+"""Every eighth of its training views is held out."""
 MOST_TRAIN_VIEWS = 16
 """Largest number of training views that are measured, evenly chosen."""
 DEFAULT_GAUSSIANS = 100_000

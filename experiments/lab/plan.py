@@ -16,15 +16,18 @@ from lab.markdown import table
 from lab.queue import estimated_bytes
 from lab.stages import Stage, runs_by_cell, scene_text, stages_of
 
-GPU_SECONDS, GPU_SECONDS_PER_GAUSSIAN = 0.002, 2.4e-8
+GPU_SECONDS = 0.002
+GPU_SECONDS_PER_GAUSSIAN = 2.4e-8
 """Time of a plain step: 14 ms for 500,000 Gaussians, from the paper's 7.18 minutes for 30,000 iterations."""
 GPU_TEXTURED = 2.0
 """Ratio of a textured step to a plain one: 19.7 minutes, if they are for both stages, leave 25 ms a step."""
 CPU_SECONDS_PER_GAUSSIAN = 2.4e-6
 """Seconds for a view on one core (docs/performance.md); all cores share them."""
 CPU_SECONDS_PER_PIXEL = 0.72e-6
-COMPILE_SECONDS, OTHER_SECONDS = 5.0, 4.0
-"""Seconds on one core to compile a program of training, and to load, measure and save a stage."""
+COMPILE_SECONDS = 5.0
+"""Seconds on one core to compile a program of training."""
+OTHER_SECONDS = 4.0
+"""Seconds on one core to load, measure and save a stage."""
 MOST_ROWS = 40
 """Largest number of cells in the table."""
 FINISHED = "the steps of finished stages of the same size"

@@ -38,8 +38,10 @@ GPU_SHARE = 0.8
 MEMORY_FRACTIONS = ("XLA_CLIENT_MEM_FRACTION", "XLA_PYTHON_CLIENT_MEM_FRACTION")
 """Variables with the share of a GPU's memory for a process: JAX's present one and its former one. JAX refuses both
 together."""
-SPARE_SHARE, MOST_SPARE = 0.1, 30.0
-"""Time before a limit at which trainings stop, to write their checkpoints: a share of the limit, and seconds."""
+SPARE_SHARE = 0.1
+"""Time before a limit at which trainings stop, to write their checkpoints, as a share of the limit."""
+MOST_SPARE = 30.0
+"""Largest such time, in seconds."""
 
 Records = Mapping[str, Record]
 Ask = Callable[[Records], Iterable[Job]]
@@ -203,7 +205,9 @@ class SubmititPool:
             import submitit
         except ImportError as error:
             raise ValueError("--cluster needs submitit: pip install 'a2tg-jax[experiments]'") from error
-        self.slots, self.memory, self.limit = slots, memory, TimeLimit()
+        self.slots = slots
+        self.memory = memory
+        self.limit = TimeLimit()
         self.shares_devices = cluster == "local" and slots > 1
         # Pickled jobs name this package, which their processes must find.
         paths = [str(Path(__file__).resolve().parents[1]), os.environ.get("PYTHONPATH", "")]

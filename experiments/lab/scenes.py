@@ -81,7 +81,8 @@ def from_random_points(scene: a2tg.Scene) -> a2tg.Scene:
     """
     sights = [Sight.of_camera(view.camera) for view in scene.train]
     points = random_points(sights, scene.transform.rotation)[:NUM_POINTS]
-    if lost := unseeing(points, sights):
+    lost = unseeing(points, sights)
+    if lost:
         raise ValueError(
             f"{scene.name}: random_start needs views of one object; {scene.train[lost[0]].name} shows none"
         )

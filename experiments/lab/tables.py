@@ -21,8 +21,10 @@ from lab.markdown import table as markdown
 from lab.scenes import SceneAt
 
 T = TypeVar("T")
-EQUAL_BYTES, EQUAL_TIME = ", equal bytes", ", equal time"
-"""Ends of the labels of methods in the bytes, or in the training time, of the reference."""
+EQUAL_BYTES = ", equal bytes"
+"""End of the labels of methods in the bytes of the reference."""
+EQUAL_TIME = ", equal time"
+"""End of the labels of methods in the training time of the reference."""
 PAPER: dict[str, list[dict[str, Any]]] = read_json(Path(__file__).with_name("paper.json"))
 """The figures that the paper publishes, by table."""
 MISSING = "–"
