@@ -55,6 +55,7 @@ FLAGS[RunRecord] = {
     "compare_options": (Fixed, Suppress),
 }
 BASELINE = "gaussians-2d-mcmc"
+SCENE_IS_MISSING = "SCENE is missing: a folder, or built in, synthetic or cells: a2tg train SCENE --out RUN"
 HEARTBEAT_TIMEOUT = 60.0
 """Default of --heartbeat-timeout-seconds."""
 ADDRESS = re.compile(r"(\[[0-9A-Fa-f:.]+(%[\w.-]+)?\]|[^:\[\]]+):\d+")
@@ -176,7 +177,7 @@ class Train:
 
     def run(self) -> None:
         if not self.record.scene.path:
-            raise ValueError("SCENE is missing: a folder, or built in, synthetic or cells: a2tg train SCENE --out RUN")
+            raise ValueError(SCENE_IS_MISSING)
         # Processes must join before anything starts the devices of JAX.
         with joined(self.place, lambda: f"continue with: {resuming_command(RunFolder(self.out))}"):
             session = Session(after_compiling=tidy_memory, devices=devices_named(self.devices))
@@ -303,6 +304,8 @@ def train_defaults(arguments: Sequence[str]) -> Train:
     Raises:
       ValueError, FileNotFoundError: if there is no such system, preset, file or run, or it is invalid.
     """
+    if not arguments:
+        raise ValueError(SCENE_IS_MISSING)
     given, _ = tyro.cli(DecidingOptions, prog="a2tg train", args=arguments, return_unknown_args=True, add_help=False)
     for path in (given.config, given.out):
         expanded(path)  # Raises ValueError for a URL.
