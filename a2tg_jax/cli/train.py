@@ -43,7 +43,7 @@ from a2tg_jax.results.run_training import RunOptions, begin_run, resume_run, uns
 from a2tg_jax.results.viewing import shown_live
 from a2tg_jax.training.loop import Watch
 
-FLAGS[SceneSource] = {"path": (Positional, arg(metavar="SCENE"))}
+FLAGS[SceneSource] = {"path": (Positional, arg(metavar="SCENE", help_behavior_hint="(required)"))}
 FLAGS[RunRecord] = {
     "scene": (arg(name=""),),
     "system": (arg(metavar="NAME"),),
