@@ -12,12 +12,6 @@ from a2tg_jax.results.record import DEFAULT_SYSTEM
 from a2tg_jax.training import SYSTEMS
 
 PAGE = Path(__file__).resolve().parents[1] / "options.md"
-OPENING = '''"""Flags of each command, so that a misspelt one is reported without importing the commands.
-
-Written by docs/scripts/options.py.
-"""
-
-'''
 OPENING = """# Options
 
 Arguments and options of every command, with their defaults, as `a2tg COMMAND --help-all` prints them. This page
