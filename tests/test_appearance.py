@@ -194,7 +194,8 @@ def test_copies_of_movable_kernels_are_those_of_a_gaussian_as_opaque():
     smaller, shared = appearance.share(gaussians, num_shares)
     logits, log_scales = share(logit(before), gaussians.log_scales, num_shares)
     np.testing.assert_allclose(shared.opacities(smaller), jax.nn.sigmoid(logits), rtol=1e-5)
-    np.testing.assert_array_equal(smaller.log_scales, log_scales)
+    # JAX rounds its logit otherwise.
+    np.testing.assert_allclose(smaller.log_scales, log_scales, rtol=1e-6)
     kept = shared.kernel_opacities / appearance.kernel_opacities
     np.testing.assert_allclose(kept, jnp.broadcast_to(kept[:, :1], kept.shape), rtol=1e-5)
 

@@ -109,7 +109,7 @@ def test_models_of_two_extents_are_not_joined():
     wide = some_model(a2tg.A2tg(sh_degree=0))
     assert a2tg.concatenate([narrow, narrow]).appearance.texture_options == NARROW
     with pytest.raises(
-        ValueError, match=r"one extent; got 1\.5 and 3: train them with the same lookup\.extent, or bake"
+        ValueError, match=r"one extent; got 1\.5 and 3: train them with the same lookup\.extent, or convert"
     ):
         a2tg.concatenate([narrow, wide])
 
