@@ -192,12 +192,20 @@ class Remember(StepEvent):
         return Change(model, moments, state)
 
 
+@a2tg.pytree
+class LateSplits(SplitByGradient):
+    """It gathers its statistic up to iteration 4."""
+
+    def times(self, num_iterations):
+        return (4,)
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Reversed(a2tg.System):
     name = "reversed"
 
     def stages(self):
-        events = SplitByGradient(ROWS), Reverse(), Remember()
+        events = LateSplits(ROWS), Reverse(), Remember()
         return (a2tg.Stage("gaussians", a2tg.Appearance(), events, self.loss.terms(), self.rates, 4),)
 
 
