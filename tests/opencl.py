@@ -89,7 +89,7 @@ def evaluate(closed, real, *columns):
     #define IS_FLOAT {int(real == "float")}
     #define THREADS 1
     #define NUM_SUMS 1
-    #define NUM_COLUMNS 1
+    #define NUM_VALUES 1
     {header}
     {c_function("f", closed, inputs, outputs)}
     KERNEL(evaluate)({"".join(f"GLOBAL const real *x{k}, " for k in range(len(columns)))}GLOBAL double *result) {{

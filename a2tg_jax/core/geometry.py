@@ -38,7 +38,8 @@ def fibonacci(num: int, turn: float = 0.0) -> np.ndarray:
 
 
 def pixel_sizes(means: Floats, scales: Floats, viewmat: Floats, K: Floats) -> Floats:
-    """Return the smaller standard deviation of Gaussians in pixels [N], of NumPy or JAX; 0 before the near plane."""
+    """Return the smaller standard deviation of Gaussians in pixels [N], of NumPy or JAX; 0 at depths up to the near
+    plane."""
     depths = means @ viewmat[2, :3] + viewmat[2, 3]
     # The geometric mean, for pixels that are not square.
     focal = (K[0, 0] * K[1, 1]) ** 0.5
@@ -174,11 +175,11 @@ def clipped_box(M: Sequence[Sequence[Array]], outline: Outline, cutoff: Array, n
         y = jnp.where(is_valid, y / depth, mean_y)
         return jnp.minimum(box[0], x), jnp.minimum(box[1], y), jnp.maximum(box[2], x), jnp.maximum(box[3], y)
 
-    # As Sutherland and Hodgman clip polygons: corners before the plane count, and edges where they cross it.
+    # As Sutherland and Hodgman clip polygons: corners beyond the plane count, and edges where they cross it.
     for point, following in zip(points, points[1:] + points[:1], strict=True):
-        is_before = point[2] >= near_plane
-        box = joined(box, is_before, point)
-        crosses = is_before != (following[2] >= near_plane)
+        is_beyond = point[2] >= near_plane
+        box = joined(box, is_beyond, point)
+        crosses = is_beyond != (following[2] >= near_plane)
         fraction = jnp.where(crosses, (near_plane - point[2]) / jnp.where(crosses, following[2] - point[2], 1.0), 0.0)
         cut = tuple(a + fraction * (b - a) for a, b in zip(point, following, strict=True))
         box = joined(box, crosses, cut)

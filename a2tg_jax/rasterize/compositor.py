@@ -21,7 +21,7 @@ from a2tg_jax.core.bilinear import TextureRegion, within_texels
 from a2tg_jax.rasterize import tiles
 from a2tg_jax.rasterize.kernels import xla
 from a2tg_jax.rasterize.kernels.platforms import by_platform, choose, cotangent_of, instead_of
-from a2tg_jax.rasterize.splats import PassInputs, PassSettings, Splats, Wanted
+from a2tg_jax.rasterize.splats import CompositorChoice, PassInputs, PassSettings, Splats
 from a2tg_jax.rasterize.tile_pixels import TilePixels
 from a2tg_jax.rasterize.tiles import TileGrid, TileLists
 
@@ -64,7 +64,7 @@ def composite(
     else:
         mark = functools.partial(_reverse_only, settings.compositor)
         splats, texels, probe = jax.tree.map(mark, (splats, texels, probe))
-        images = _composite_tiles(settings, splats, texels, regions, cutoff, lists, jacobian, probe)
+        images = _composite_tiles(settings, PassInputs(splats, texels, regions, cutoff, lists), jacobian, probe)
     channels, transmittance = images
     return _assemble(channels, settings.grid), _assemble(transmittance, settings.grid)
 
@@ -80,7 +80,7 @@ def _assemble(tiles: Array, grid: TileGrid) -> Array:
 
 
 def list_tiles(
-    compositor: Wanted, M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capacity: int,
+    compositor: CompositorChoice, M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capacity: int,
     pixels: TilePixels | None = None,
 ) -> TileLists:  # fmt: skip
     """List the splats that touch each tile, as `tiles.tile_lists` does, by native loops where they run.
@@ -98,7 +98,7 @@ def list_tiles(
     return TileLists(*by_platform(_lists_on, (compositor, near_plane, grid, capacity), results, M, cutoff))
 
 
-def _lists_on(platform: str, compositor: Wanted, near_plane: float, grid: TileGrid, capacity: int) -> Any:
+def _lists_on(platform: str, compositor: CompositorChoice, near_plane: float, grid: TileGrid, capacity: int) -> Any:
     def lists(M: Array, cutoff: Array) -> tuple[Array, ...]:
         # `cuda` has no function of this name.
         tile_lists = getattr(_kernels(compositor, platform), "tile_lists", tiles.tile_lists)
@@ -107,9 +107,8 @@ def _lists_on(platform: str, compositor: Wanted, near_plane: float, grid: TileGr
     return lists
 
 
-def _forward(settings: PassSettings, *arrays: Any) -> tuple[Array, Array]:
-    """Return channels [tiles, D, P] and transmittance [tiles, P], given fields of `PassInputs`, jacobian and probe."""
-    inputs = PassInputs(*arrays[:5])
+def _forward(settings: PassSettings, inputs: PassInputs, jacobian: Array, probe: Array) -> tuple[Array, Array]:
+    """Return channels [tiles, D, P] and transmittance [tiles, P]; jacobian and probe are for the backward pass."""
     tiles = settings.grid.num
     shapes = (tiles, settings.num_channels, settings.num_pixels), (tiles, settings.num_pixels)
     results = tuple(jax.ShapeDtypeStruct(shape, inputs.splats.M.dtype) for shape in shapes)
@@ -119,25 +118,27 @@ def _forward(settings: PassSettings, *arrays: Any) -> tuple[Array, Array]:
 _composite_tiles = jax.custom_vjp(_forward, nondiff_argnums=(0,))
 
 
-def _composite_tiles_fwd(settings: PassSettings, *arrays: Any) -> tuple[tuple[Array, Array], tuple[Any, ...]]:
-    images = _forward(settings, *arrays)
-    return images, (*arrays, *images)
+def _composite_tiles_fwd(
+    settings: PassSettings, inputs: PassInputs, jacobian: Array, probe: Array
+) -> tuple[tuple[Array, Array], tuple[Any, ...]]:
+    images = _forward(settings, inputs, jacobian, probe)
+    return images, (inputs, jacobian, probe, images)
 
 
 def _composite_tiles_bwd(
     settings: PassSettings, residuals: tuple[Any, ...], cotangents: tuple[Array, Array]
-) -> tuple[Splats, Array, None, None, None, None, Array]:
-    *arrays, channels, transmittance = residuals
+) -> tuple[PassInputs, None, Array]:
+    inputs, jacobian, probe, (channels, transmittance) = residuals
     g, g_transmittance = cotangents
     # B of the whole list: Σ g·c·α·T over the splats is g·channels, and what is behind them has weight T.
     suffix_sum = jnp.sum(g * channels, axis=1) + g_transmittance * transmittance
-    inputs = PassInputs(*arrays[:5])
-    jacobian, probe = arrays[5:]
     differentiated = inputs.splats, inputs.texels, probe
     results = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), differentiated)
     gradients = _by_platform("backward", settings, results, inputs, jacobian, probe, g, suffix_sum)
     d_splats, d_texels, d_probe = cotangent_of(differentiated, gradients)
-    return d_splats, d_texels, None, None, None, None, d_probe
+    # None: not differentiated.
+    d_inputs: Any = (d_splats, d_texels, None, None, None)
+    return PassInputs(*d_inputs), None, d_probe
 
 
 _composite_tiles.defvjp(_composite_tiles_fwd, _composite_tiles_bwd)
@@ -158,7 +159,7 @@ def _pass_on(platform: str, name: str, settings: PassSettings) -> Any:
     return functools.partial(getattr(kernels, name), _batched_on(platform, settings))
 
 
-def _kernels(compositor: Wanted, platform: str) -> Any:
+def _kernels(compositor: CompositorChoice, platform: str) -> Any:
     chosen = choose(compositor, platform)
     # Imported here: `native` needs llvmlite, which may be missing, and programs on CPUs do not use `cuda`.
     return xla if chosen in ("xla", "autodiff") else importlib.import_module(f"{xla.__package__}.{chosen}.composite")

@@ -97,7 +97,8 @@ def planes_of(M: Rows, tile: TileNumbers) -> Planes:
 
     With a frame, pixels are counted in it (`tile_pixels`).
     """
-    first, second, last = zip(*(_from_center(column, tile) for column in zip(*M, strict=True)), strict=True)
+    columns = [_from_center(column, tile) for column in zip(*M, strict=True)]
+    first, second, last = zip(*columns, strict=True)
     # 2DGS: the pixel's ray is the intersection of the planes k = x·M₂ − M₀ and l = y·M₂ − M₁, and p = k × l. It is
     # bilinear: x and y multiply the cross products with the last row, and x·y the one of the last row with itself, 0.
     a = _cross(second, last)

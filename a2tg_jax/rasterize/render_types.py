@@ -14,7 +14,7 @@ from a2tg_jax.core.notebook_display import as_bytes, enlarged, png
 from a2tg_jax.core.pytree import pytree
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.rasterize.kernels.platforms import MAX_TILE_SIZE
-from a2tg_jax.rasterize.splats import Wanted
+from a2tg_jax.rasterize.splats import CompositorChoice
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +41,7 @@ class RenderSettings(NamedFields):
     capacity: int | None = None
     """Largest number of (splat, tile) pairs, at least 1, as `plan_render` finds it. None: an eager call finds it, jit
     raises. If it is too small, the image is only the background and `overflow` is True; an eager call then warns."""
-    compositor: Wanted = "auto"
+    compositor: CompositorChoice = "auto"
     """Native loops (CPUs, with llvmlite), CUDA kernels (NVIDIA GPUs) or XLA. "auto" takes the first one that runs where
     the arrays are, and XLA with a warning if it does not support the appearance. These are differentiated once, in
     reverse mode; "autodiff", slower and by XLA, in any mode and to any order."""
@@ -55,7 +55,7 @@ class RenderSettings(NamedFields):
         """Refuse numbers out of range; convert numpy's integers to Python's, which are static for jit."""
         check_number("near_plane", self.near_plane, above=0)
         check_kind("texture", self.texture, TextureOptions)
-        check_literal("compositor", self.compositor, Wanted)
+        check_literal("compositor", self.compositor, CompositorChoice)
         for name, least, most in (("tile_size", 1, MAX_TILE_SIZE), ("sh_degree", 0, 3), ("supersample", 1, None)):
             check_int(name, getattr(self, name), least, most)
         for name, least in (("capacity", 1), ("tile_batch", 0)):

@@ -23,7 +23,7 @@ from a2tg_jax.rasterize.tiles import TileGrid, TileLists
 
 Compositor = Literal["cuda", "native", "xla", "autodiff"]
 """CUDA kernels (NVIDIA GPUs), native loops (CPUs), XLA (everywhere), or XLA code that JAX differentiates."""
-Wanted = Literal["auto", "cuda", "native", "xla", "autodiff"]
+CompositorChoice = Literal["auto", "cuda", "native", "xla", "autodiff"]
 """A compositor, or the first of native loops, CUDA kernels and XLA that runs on the platform that JAX compiles for."""
 
 
@@ -48,7 +48,7 @@ class PassSettings(NamedTuple):
 
     static: StaticShading  # the appearance without its arrays
     num_own_numbers: int  # K, numbers per splat of the appearance
-    num_columns: int  # C, numbers per texel; 0 without textures
+    num_values: int  # C, numbers per texel; 0 without textures
     num_colors: int  # D, colours of a splat
     dtype: str  # of all computations: "float32" or "float64"
     grid: TileGrid
@@ -56,7 +56,7 @@ class PassSettings(NamedTuple):
     has_geometry: bool  # whether depth, squared depth and normals are composited as well
     statistic: Statistic | None = None  # computed by the backward pass for densification
     has_rays: bool = False  # whether pixels have rays of their own (`tile_pixels`)
-    compositor: Wanted = "auto"
+    compositor: CompositorChoice = "auto"
     tile_batch: int | None = None
     """Number of tiles that XLA composites at once; 0: all. None: one for the platform, set where that is known."""
 
@@ -68,7 +68,7 @@ class PassSettings(NamedTuple):
     @property
     def arguments(self) -> Arguments:
         """Arguments of the element-wise functions of the appearance."""
-        return Arguments(self.num_own_numbers, self.num_columns, self.num_colors, self.dtype)
+        return Arguments(self.num_own_numbers, self.num_values, self.num_colors, self.dtype)
 
     @property
     def num_pixels(self) -> int:
@@ -190,7 +190,7 @@ def settings_of_pass(
     settings = PassSettings(
         static=StaticShading.of(appearance),
         num_own_numbers=splats.numbers.shape[1],
-        num_columns=0 if regions is None else texels.shape[1],
+        num_values=0 if regions is None else texels.shape[1],
         num_colors=splats.colors.shape[1],
         dtype=np.dtype(splats.M.dtype).name,
         grid=grid,

@@ -170,7 +170,7 @@ class PixelFunctions:
         normal = triple if settings.has_geometry else None
         numbers = (number,) * settings.num_own_numbers
         splat = pixel.Splat((triple,) * 3, number, (number,) * settings.num_colors, normal, numbers)
-        values = (number,) * settings.num_columns
+        values = (number,) * settings.num_values
         region = TextureRegion(integer, integer, integer) if values else None
         lookup = Lookup(region, Sample(values, values, values)) if region else None
 

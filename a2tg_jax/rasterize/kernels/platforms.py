@@ -21,7 +21,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from a2tg_jax.rasterize.kernels.cuda import nvrtc
-from a2tg_jax.rasterize.splats import Compositor, Wanted
+from a2tg_jax.rasterize.splats import Compositor, CompositorChoice
 
 T = TypeVar("T")
 DETERMINISM_FLAGS = ("--xla_gpu_deterministic_ops", "--xla_gpu_exclude_nondeterministic_ops")
@@ -37,13 +37,13 @@ REMEDIES: dict[Compositor, str] = {
 """Requirements of the same compositors."""
 
 
-def check_compositor(compositor: Wanted) -> None:
+def check_compositor(compositor: CompositorChoice) -> None:
     """Raise ValueError if a package that a compositor needs is not installed."""
     if compositor != "auto":
         choose(compositor, PLATFORMS.get(compositor, ""))
 
 
-def choose(compositor: Wanted, platform: str) -> Compositor:
+def choose(compositor: CompositorChoice, platform: str) -> Compositor:
     """Return the given compositor, or for "auto" the fastest one for the platform that JAX compiles for.
 
     Raises:
@@ -73,7 +73,7 @@ def wants_determinism() -> bool:
     return any(is_on.get(flag, False) for flag in DETERMINISM_FLAGS)
 
 
-def instead_of(compositor: Wanted, appearance: type, reason: str) -> None:
+def instead_of(compositor: CompositorChoice, appearance: type, reason: str) -> None:
     """Warn, once per class, that XLA composites an appearance that kernels cannot run; ValueError if they must."""
     if compositor != "auto":
         raise ValueError(f"compositor={compositor!r} cannot run {appearance.__name__}: {reason}. Say 'xla', or 'auto'")

@@ -72,10 +72,10 @@ def backward(
       g: [tiles, D, P] cotangents of the channels.
       suffix_sum: [tiles, P] B of the whole list (`rasterize.pixel.absorb_vjp`).
     """
-    on_blocks = _TracedPass(settings, inputs)
+    traced = _TracedPass(settings, inputs)
     splats = inputs.splats
-    size = on_blocks.size
-    groups = on_blocks.num_groups
+    size = traced.size
+    groups = traced.num_groups
     widths = [math.prod(leaf.shape[1:]) for leaf in splats]
     # One row per splat: one scatter adds a block, where each field would need its own.
     packed = jnp.zeros((splats.M.shape[0], sum(widths)), splats.M.dtype)
@@ -89,13 +89,13 @@ def backward(
     suffix_sum = grouped(suffix_sum)
 
     def group(index: Array, totals: tuple[Array, Array, Array]) -> Any:
-        tiles, start = on_blocks.tiles_of_group(index)
-        pull_back = on_blocks.over_tiles(functools.partial(on_blocks.block_vjp, jacobian))
+        tiles, start = traced.tiles_of_group(index)
+        pull_back = traced.over_tiles(functools.partial(traced.block_vjp, jacobian))
 
         def step(carry: tuple[Any, ...]) -> tuple[Any, ...]:
             at, *state, (packed, texels, probe) = carry
-            ids = on_blocks.block_ids(at)
-            *state, (d_splats, d_probe, d_texels) = pull_back(on_blocks.gather(ids), at, tiles, *state, g[index])
+            ids = traced.block_ids(at)
+            *state, (d_splats, d_probe, d_texels) = pull_back(traced.gather(ids), at, tiles, *state, g[index])
             flat = ids.reshape(-1)
             rows = jnp.concatenate([leaf.reshape(flat.shape[0], -1) for leaf in d_splats], axis=1)
             packed = packed.at[flat].add(rows)
@@ -106,7 +106,7 @@ def backward(
                 probe = probe.at[flat].add(d_probe.reshape(flat.shape[0], -1))
             return (at + BLOCK, *state, (packed, texels, probe))
 
-        carry = (start, *on_blocks.initial_pixels(tiles), suffix_sum[index], totals)
+        carry = (start, *traced.initial_pixels(tiles), suffix_sum[index], totals)
         return jax.lax.while_loop(functools.partial(_has_splats_left, tiles.end), step, carry)[-1]
 
     totals = packed, jnp.zeros_like(inputs.texels), jnp.zeros_like(probe)

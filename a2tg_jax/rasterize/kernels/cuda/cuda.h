@@ -48,19 +48,19 @@ static __device__ __forceinline__ void add_in_warp(real *row, const real *number
 
 // Four floats of a texel in one instruction.
 static __device__ __forceinline__ void read_texel(const real *row, real *numbers) {
-#if NUM_COLUMNS == 4 && IS_FLOAT
+#if NUM_VALUES == 4 && IS_FLOAT
   const float4 texel = __ldg((const float4 *)row);
   numbers[0] = texel.x, numbers[1] = texel.y, numbers[2] = texel.z, numbers[3] = texel.w;
 #else
-  for (int c = 0; c < NUM_COLUMNS; c++) numbers[c] = row[c];
+  for (int c = 0; c < NUM_VALUES; c++) numbers[c] = row[c];
 #endif
 }
 
 // Adds weighted numbers to a texel; four floats in one instruction where the GPU has one.
 static __device__ __forceinline__ void add_texel(real *row, real weight, const real *numbers) {
-#if NUM_COLUMNS == 4 && IS_FLOAT && __CUDA_ARCH__ >= 900
+#if NUM_VALUES == 4 && IS_FLOAT && __CUDA_ARCH__ >= 900
   atomicAdd((float4 *)row, make_float4(weight * numbers[0], weight * numbers[1], weight * numbers[2], weight * numbers[3]));
 #else
-  for (int c = 0; c < NUM_COLUMNS; c++) atomicAdd(row + c, weight * numbers[c]);
+  for (int c = 0; c < NUM_VALUES; c++) atomicAdd(row + c, weight * numbers[c]);
 #endif
 }

@@ -28,7 +28,7 @@
 #define ANY_IN_BLOCK(flag) any_in_group(&votes, flag)
 #define ANY_IN_WARP(flag) any_in_group(&votes, flag)
 #define ADD_IN_WARP(row, numbers) add_in_group(numbers_of_warp, row, numbers)
-#define READ_TEXEL(row, numbers) for (int c = 0; c < NUM_COLUMNS; c++) (numbers)[c] = (row)[c]
+#define READ_TEXEL(row, numbers) for (int c = 0; c < NUM_VALUES; c++) (numbers)[c] = (row)[c]
 #define ADD_TEXEL(row, weight, numbers) add_texel(row, weight, numbers)
 #define ATOMIC_ADD(place, number) add_atomically(place, number)
 #define TOTALS_AGAIN
@@ -67,5 +67,5 @@ static void add_atomically(volatile __global real *place, real number) {
 }
 
 static void add_texel(__global real *row, real weight, const real *numbers) {
-  for (int c = 0; c < NUM_COLUMNS; c++) add_atomically(row + c, weight * numbers[c]);
+  for (int c = 0; c < NUM_VALUES; c++) add_atomically(row + c, weight * numbers[c]);
 }

@@ -73,10 +73,10 @@ def source(kernel: PassSettings, dialect: Dialect) -> str:
         "BATCH": 64 if kernel.dtype == "float32" else 32,
         "NUM_NUMBERS": num_numbers,
         "NUM_PLANES": functions.num_planes,
-        "NUM_COLUMNS": kernel.num_columns,
+        "NUM_VALUES": kernel.num_values,
         "NUM_CHANNELS": kernel.num_channels,
         "COUNT": count,
-        "NUM_SUMS": count + 1 + kernel.num_columns,
+        "NUM_SUMS": count + 1 + kernel.num_values,
         "HAS_STATISTIC": int(bool(kernel.statistic)),
         "IS_FLOAT": int(kernel.dtype == "float32"),
         "CUTOFF_SLACK": CUTOFF_SLACK,
@@ -105,15 +105,15 @@ class Argument(NamedTuple):
 
 def _pixel_functions(kernel: PassSettings, functions: PixelFunctions, count: int) -> list[str]:
     """Return the functions that tiles.c calls; `blend_vjp` writes `count` sums."""
-    num_columns = kernel.num_columns
-    has_texture = kernel.num_columns > 0
+    num_values = kernel.num_values
+    has_texture = kernel.num_values > 0
     planes = Argument("planes", functions.num_planes)
     numbers = Argument("numbers", kernel.num_floats - 1)
     M = Argument("numbers", 9)
     tile = (Argument("tile_x"), Argument("tile_y"))
     region = Argument("region", 3 if has_texture else 0, "int")
     position = Argument("position", 2 * has_texture)
-    sample = Argument("sample", num_columns)
+    sample = Argument("sample", num_values)
     pixel = Argument("x"), Argument("y"), Argument("transmittance"), Argument("is_live", kind="int")
     state = Argument("transmittance_after"), Argument("is_live_after", kind="int")
     channels = Argument("channels", kernel.num_channels)
@@ -127,12 +127,12 @@ def _pixel_functions(kernel: PassSettings, functions: PixelFunctions, count: int
             "blend_vjp",
             functions.backward,
             [
-                *(planes, numbers, region, Argument("sample", 3 * num_columns), *pixel, Argument("suffix_sum")),
+                *(planes, numbers, region, Argument("sample", 3 * num_values), *pixel, Argument("suffix_sum")),
                 *(Argument("g", kernel.num_channels), Argument("center", 2), Argument("jacobian", 9)),
             ],
             [
                 *(*state, Argument("suffix_sum_after"), Argument("contributes", kind="int")),
-                *(Argument("d_values", num_columns), Argument("sums", count)),
+                *(Argument("d_values", num_values), Argument("sums", count)),
             ],
         ),
     ]
@@ -154,11 +154,11 @@ def _texture_functions(kernel: PassSettings, region: Argument, position: Argumen
         return bilinear.or_empty(bilinear.interpolate(around, texels), region, empty)
 
     weights = ((number,) * 4,) * 3
-    at_corners = ((number,) * kernel.num_columns,) * 4
+    at_corners = ((number,) * kernel.num_values,) * 4
     texel = Argument("texel", 4, "int")
     weight = Argument("weights", 12)
-    at_corner = Argument("at_corners", 4 * kernel.num_columns)
-    sample = Argument("sample", 3 * kernel.num_columns)
+    at_corner = Argument("at_corners", 4 * kernel.num_values)
+    sample = Argument("sample", 3 * kernel.num_values)
     return [
         c_function("corners", trace(corners, place, number, number)[0], [region, position], [texel, weight]),
         c_function(

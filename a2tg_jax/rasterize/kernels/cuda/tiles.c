@@ -18,7 +18,7 @@ typedef struct ALIGNED {
   real limit;  // Squared distance within which a pixel is looked at.
   int id, region[3];
   real numbers[NUM_NUMBERS];
-  real texel[NUM_COLUMNS + 1];  // The texel of a texture that has only one.
+  real texel[NUM_VALUES + 1];  // The texel of a texture that has only one.
 } Entry;
 
 // Pixels of a warp form a block of 8×4 if such blocks fill the tile: a compact block sees fewer splats than a row does.
@@ -52,14 +52,14 @@ INLINE void load(
   for (int k = 0; k < NUM_NUMBERS; k++) entry->numbers[k] = numbers[k] = row[k];
   prepare(numbers, at.tile_x, at.tile_y, planes);
   for (int k = 0; k < NUM_PLANES; k++) entry->planes[k] = planes[k];
-  for (int k = 0; k < 3; k++) entry->region[k] = NUM_COLUMNS ? regions[(INDEX)id * 3 + k] : 0;
+  for (int k = 0; k < 3; k++) entry->region[k] = NUM_VALUES ? regions[(INDEX)id * 3 + k] : 0;
   entry->limit = row[NUM_NUMBERS] + (real)CUTOFF_SLACK;
   entry->id = id;
-#if NUM_COLUMNS
-  real texel[NUM_COLUMNS];
+#if NUM_VALUES
+  real texel[NUM_VALUES];
   if (entry->region[1] * entry->region[2] != 1) return;
-  READ_TEXEL(texels + (INDEX)entry->region[0] * NUM_COLUMNS, texel);
-  for (int c = 0; c < NUM_COLUMNS; c++) entry->texel[c] = texel[c];
+  READ_TEXEL(texels + (INDEX)entry->region[0] * NUM_VALUES, texel);
+  for (int c = 0; c < NUM_VALUES; c++) entry->texel[c] = texel[c];
 #endif
 }
 
@@ -71,23 +71,23 @@ INLINE void load(
   for (int n = 0; n < NUM_PLANES; n++) planes[n] = (entry).planes[n];             \
   for (int n = 0; n < 3; n++) region[n] = (entry).region[n]
 
-#if NUM_COLUMNS
+#if NUM_VALUES
 // What a pixel reads of the splat's texture: C values, and their derivatives by x and by y.
 INLINE void look_up(
   IN_SHARED const Entry *entry, const int *region, const real *position, GLOBAL const real *texels, int *texel,
   real *weights, real *sample
 ) {
-  real at_corners[4 * NUM_COLUMNS];
+  real at_corners[4 * NUM_VALUES];
   int area = region[1] * region[2];
   if (area == 1) { // The same at all positions; most textures have one texel.
-    for (int c = 0; c < NUM_COLUMNS; c++) sample[c] = entry->texel[c];
-    for (int c = NUM_COLUMNS; c < 3 * NUM_COLUMNS; c++) sample[c] = 0;
+    for (int c = 0; c < NUM_VALUES; c++) sample[c] = entry->texel[c];
+    for (int c = NUM_VALUES; c < 3 * NUM_VALUES; c++) sample[c] = 0;
     return;
   }
   corners(region, position, texel, weights);
-  for (int c = 0; c < 4 * NUM_COLUMNS; c++) at_corners[c] = 0;
+  for (int c = 0; c < 4 * NUM_VALUES; c++) at_corners[c] = 0;
   for (int k = 0; k < 4 && area > 0; k++)
-    READ_TEXEL(texels + (INDEX)texel[k] * NUM_COLUMNS, at_corners + k * NUM_COLUMNS);
+    READ_TEXEL(texels + (INDEX)texel[k] * NUM_VALUES, at_corners + k * NUM_VALUES);
   interpolate(region, weights, at_corners, sample);
 }
 #endif
@@ -109,10 +109,10 @@ KERNEL(forward)(
     BARRIER;
     for (int k = 0; k < count && is_live; k++) {
       UNPACK(batch[k]);
-      real rho, position[2], sample[3 * NUM_COLUMNS + 1];
+      real rho, position[2], sample[3 * NUM_VALUES + 1];
       reach(planes, region, at.x, at.y, &rho, position);
       if (!(rho <= batch[k].limit)) continue;
-#if NUM_COLUMNS
+#if NUM_VALUES
       int texel[4];
       real weights[12];
       look_up(&batch[k], region, position, texels, texel, weights, sample);
@@ -142,10 +142,10 @@ INLINE void flush(
 #if HAS_STATISTIC
   for (int k = 0; k < 4; k++) ATOMIC_ADD(d_probe + (INDEX)entry->id * 4 + k, sums[COUNT - 3 + k]);
 #endif
-#if NUM_COLUMNS
+#if NUM_VALUES
   if (entry->region[1] * entry->region[2] != 1) return;
-  for (int c = 0; c < NUM_COLUMNS; c++)
-    ATOMIC_ADD(d_texels + (INDEX)entry->region[0] * NUM_COLUMNS + c, sums[COUNT + 1 + c]);
+  for (int c = 0; c < NUM_VALUES; c++)
+    ATOMIC_ADD(d_texels + (INDEX)entry->region[0] * NUM_VALUES + c, sums[COUNT + 1 + c]);
 #endif
 }
 
@@ -176,7 +176,7 @@ KERNEL(backward)(
     int is_warp_live = ANY_IN_WARP(is_live);
     for (int k = 0; k < count && is_warp_live; k++) {
       UNPACK(batch[k]);
-      real rho, position[2], sample[3 * NUM_COLUMNS + 1], d_values[NUM_COLUMNS + 1], sums[NUM_SUMS];
+      real rho, position[2], sample[3 * NUM_VALUES + 1], d_values[NUM_VALUES + 1], sums[NUM_SUMS];
       int is_reached = 0, contributes = 0;
       if (is_live) {
         reach(planes, region, at.x, at.y, &rho, position);
@@ -184,7 +184,7 @@ KERNEL(backward)(
       }
       if (!ANY_IN_WARP(is_reached)) continue;
       for (int n = 0; n < NUM_SUMS; n++) sums[n] = 0;
-#if NUM_COLUMNS
+#if NUM_VALUES
       int texel[4];
       real weights[12];
       if (is_reached) look_up(&batch[k], region, position, texels, texel, weights, sample);
@@ -195,12 +195,12 @@ KERNEL(backward)(
       if (!contributes) // What a pixel that shows nothing would add may not be finite.
         for (int n = 0; n < NUM_SUMS; n++) sums[n] = 0;
       sums[COUNT] = contributes;
-#if NUM_COLUMNS
+#if NUM_VALUES
       int area = region[1] * region[2];
-      for (int c = 0; c < NUM_COLUMNS; c++) sums[COUNT + 1 + c] = contributes && area == 1 ? d_values[c] : 0;
+      for (int c = 0; c < NUM_VALUES; c++) sums[COUNT + 1 + c] = contributes && area == 1 ? d_values[c] : 0;
       if (contributes && area > 1)
         for (int corner = 0; corner < 4; corner++)
-          ADD_TEXEL(d_texels + (INDEX)texel[corner] * NUM_COLUMNS, weights[corner], d_values);
+          ADD_TEXEL(d_texels + (INDEX)texel[corner] * NUM_VALUES, weights[corner], d_values);
 #endif
       ADD_IN_WARP(batch_sums + k * NUM_SUMS, sums);
     }

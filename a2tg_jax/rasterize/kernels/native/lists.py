@@ -52,7 +52,7 @@ def _write_bound(module: ir.Module, name: str, dtype: str, tile_size: int, near_
     bounds_of, _ = trace(functools.partial(unclipped_bounds, near_plane=near_plane), M, number)
     clipped, _ = trace(functools.partial(clipped_box, near_plane=near_plane), M, outline, number)
     rectangle_of, _ = trace(rectangle, ScreenBounds(number, number, number, number, outline), integer, integer)
-    rooms = [w.variable(w.real) for _ in range(4)]
+    slots = [w.variable(w.real) for _ in range(4)]
     with w.loop(w.long(given["first"]), w.long(given["last"])) as (id_, _):
         base = w.at(given["M"], w.times(id_, 9), w.real)
         numbers = [w.load(base, k, w.real) for k in range(9)]
@@ -60,13 +60,13 @@ def _write_bound(module: ir.Module, name: str, dtype: str, tile_size: int, near_
         bounds = scalars.emit(bounds_of, [*numbers, cutoff])
         box = bounds[:4]
         outline_numbers = bounds[4:]
-        for edge, room in zip(box, rooms, strict=True):
-            b.store(edge, room)
+        for edge, slot in zip(box, slots, strict=True):
+            b.store(edge, slot)
         # Splats that cross the near plane are few, and their boxes cost more: a branch, not a select.
         with b.if_then(outline_numbers[-1]):
-            for edge, room in zip(scalars.emit(clipped, [*numbers, *outline_numbers, cutoff]), rooms, strict=True):
-                b.store(edge, room)
-        box = [b.load(room, typ=w.real) for room in rooms]
+            for edge, slot in zip(scalars.emit(clipped, [*numbers, *outline_numbers, cutoff]), slots, strict=True):
+                b.store(edge, slot)
+        box = [b.load(slot, typ=w.real) for slot in slots]
         row = w.at(given["rectangles"], w.times(id_, 4), INT)
         size = given["width"], given["height"]
         for k, value in enumerate(scalars.emit(rectangle_of, [*box, *outline_numbers, *size])):

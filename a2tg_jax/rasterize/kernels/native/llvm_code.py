@@ -23,7 +23,7 @@ from a2tg_jax.rasterize.kernels.jaxprs import Untranslatable
 FLAGS = ("contract",)
 """Flags that let products and sums fuse; within a lane all other IEEE rules hold."""
 ALIGNMENT = 128
-"""Bytes to which rooms on the stack and tables are aligned, the size of the largest vectors: loads of these need it."""
+"""Bytes to which slots on the stack and tables are aligned, the size of the largest vectors: loads of these need it."""
 BOOL, INT, LONG = (ir.IntType(bits) for bits in (1, 32, 64))
 POINTER = ir.PointerType()
 CompiledFunction = Callable[..., None]
@@ -58,10 +58,10 @@ class Writer:
         """Return the address of `count` values on the stack."""
         # In the entry block: within a loop, the stack would grow at every turn.
         with self.b.goto_entry_block():
-            room = self.b.alloca(type_, count)
-            room.align = ALIGNMENT
-            room.type = POINTER
-        return room
+            slot = self.b.alloca(type_, count)
+            slot.align = ALIGNMENT
+            slot.type = POINTER
+        return slot
 
     def at(self, base: ir.Value, index: ir.Value, type_: ir.Type) -> ir.Value:
         return self.b.gep(base, [index], source_etype=type_)

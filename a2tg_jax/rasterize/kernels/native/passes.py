@@ -51,7 +51,7 @@ def lanes_of(settings: PassSettings, vector_bytes: int) -> int:
     in_register = llvm_code.num_lanes(settings.dtype)
     itemsize = np.dtype(settings.dtype).itemsize
     # In float64, exp is called lane by lane, also for lanes that are not reached.
-    if settings.num_columns or itemsize > 4:
+    if settings.num_values or itemsize > 4:
         return in_register
     lanes = vector_bytes // itemsize
     # Vectors that do not divide the tile would compute pixels that do not exist.
@@ -118,7 +118,7 @@ class _Pass(TexelWriter):
         super().__init__(module, name, buffers, INTEGERS, settings.dtype)
         self.settings = settings
         self.functions = functions
-        self.num_columns = settings.num_columns
+        self.num_values = settings.num_values
         self.empty = settings.static.functions.empty
         self.tile_size = settings.grid.tile_size
         self.lanes = Lanes(self.b, lanes_of(settings, self.vector_bytes))
@@ -223,7 +223,7 @@ class _Pass(TexelWriter):
         planes = self.scalars.emit(self.functions.prepare, [*numbers[:9], *tile])
         limit = self.b.fadd(cutoff, self.real(CUTOFF_SLACK))
         region_row = self.at(arguments["regions"], self.times(id_, 3), INT)
-        region = [self.load(region_row, k, INT) for k in range(3)] if self.num_columns else []
+        region = [self.load(region_row, k, INT) for k in range(3)] if self.num_values else []
         texture = self.texture(arguments["texels"], *map(self.long, region)) if region else None
         spread = self.spread(planes), self.spread(numbers)
         return _LoadedSplat(numbers, *spread, texture, self.spread(region), self.lanes.broadcast(limit))
@@ -315,8 +315,8 @@ class _Backward(_Pass):
                 *rows, d_texture = self.rows_of(id_, position, splat.texture)
                 b.store(BOOL(0), self.any_contributes)
                 # Planes, all numbers but the homography, three of the statistic and the number of pixels.
-                num_sums = self.functions.num_planes + (len(splat.numbers) - 9) + (4 if settings.statistic else 0)
-                totals = self.zeros(num_sums)
+                num_totals = self.functions.num_planes + (len(splat.numbers) - 9) + (4 if settings.statistic else 0)
+                totals = self.zeros(num_totals)
                 for vector in self.reached_vectors(splat):
                     self.pull_back(splat, vector, same_everywhere, totals, d_texture)
                 # Sums over lanes take as long as a vector of pixels: once per splat and tile, and only if needed.
@@ -353,8 +353,8 @@ class _Backward(_Pass):
         transmittance, still_live, suffix_sum, contributes, *rest = lanes.emit(self.functions.backward, at_pixel)
         self.store_state(k, transmittance, still_live)
         self.store(suffix_sum, self.suffix_sum, k)
-        d_values = rest[: self.num_columns]
-        sums = rest[self.num_columns :]
+        d_values = rest[: self.num_values]
+        sums = rest[self.num_values :]
         if self.settings.statistic:
             sums.append(lanes.constant(1.0, self.real))
         # Selected, not multiplied: the cotangents of a pixel that shows nothing may not be finite.

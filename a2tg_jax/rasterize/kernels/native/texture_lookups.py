@@ -48,14 +48,14 @@ class TexelWriter(Writer):
 
     lanes: Lanes  # operations on vectors of L pixels
     reals: ir.Type  # type of a vector of L floats
-    num_columns: int  # number C of numbers per texel
+    num_values: int  # number C of numbers per texel
     empty: Sequence[float]  # C values of a splat without a texture; empty if all splats have one
     sums: ir.Value  # cotangents of a small texture's texels in each lane, `num_sums` vectors; zero before a splat
 
     @property
     def num_sums(self) -> int:
         """Number of vectors in `sums`: C for every texel of the largest small texture."""
-        return SMALL_HEIGHT * max(SMALL_WIDTHS) * self.num_columns
+        return SMALL_HEIGHT * max(SMALL_WIDTHS) * self.num_values
 
     @property
     def small_widths(self) -> tuple[int, ...]:
@@ -64,11 +64,11 @@ class TexelWriter(Writer):
 
     def texture(self, texels: ir.Value, first: ir.Value, height: ir.Value, width: ir.Value) -> NativeTexture:
         """Return the texture that begins with texel `first`."""
-        return NativeTexture(self.at(texels, self.times(first, self.num_columns), self.real), height, width)
+        return NativeTexture(self.at(texels, self.times(first, self.num_values), self.real), height, width)
 
     def sample(self, texture: NativeTexture, place: Place, has_slopes: bool) -> list[ir.Value]:
         """Return C interpolated values and, with slopes, their C derivatives along x and C along y."""
-        count = self.num_columns
+        count = self.num_values
         num_slopes = count if has_slopes else 0
         values = self.zeros(count)
         along_x = self.zeros(num_slopes)
@@ -108,7 +108,7 @@ class TexelWriter(Writer):
                     # Lanes are summed once per splat and tile, not once per vector of pixels.
                     texel = self.b.add(self.times(row.index, width), column.index)
                     for k, addend in enumerate(addends):
-                        index = self.b.add(self.times(texel, self.num_columns), LONG(k))
+                        index = self.b.add(self.times(texel, self.num_values), LONG(k))
                         self.store(self.b.fadd(self.load(self.sums, index, self.reals), addend), self.sums, index)
 
     def finish_texels(self, texture: NativeTexture) -> None:
@@ -119,9 +119,9 @@ class TexelWriter(Writer):
             b.icmp_signed(">", self.small_width(texture), LONG(0)), b.mul(texture.height, texture.width), LONG(0)
         )
         with self.loop(LONG(0), num) as (place, _):
-            base = self.at(self.sums, self.times(place, self.num_columns), self.reals)
-            addends = [self.load(base, k, self.reals) for k in range(self.num_columns)]
-            for k in range(self.num_columns):
+            base = self.at(self.sums, self.times(place, self.num_values), self.reals)
+            addends = [self.load(base, k, self.reals) for k in range(self.num_values)]
+            for k in range(self.num_values):
                 self.store(zero, base, k)
             self.add_sums(self.entry(texture, place), addends)
 
@@ -212,7 +212,7 @@ class TexelWriter(Writer):
 
     def entry(self, texture: NativeTexture, index: ir.Value) -> ir.Value:
         """Return the address of a texel, counted row by row."""
-        return self.at(texture.first, self.times(index, self.num_columns), self.real)
+        return self.at(texture.first, self.times(index, self.num_values), self.real)
 
     def add_sums(self, entry: ir.Value, vectors: Sequence[ir.Value]) -> None:
         """Add the sums over lanes of C vectors to a texel."""
@@ -237,13 +237,13 @@ class TexelWriter(Writer):
 
     def zeros(self, num: int) -> list[ir.Value]:
         """Return variables of one vector each, set to zero at this point."""
-        rooms = [self.variable(self.reals) for _ in range(num)]
-        for room in rooms:
-            self.b.store(self.lanes.constant(0.0, self.real), room)
-        return rooms
+        slots = [self.variable(self.reals) for _ in range(num)]
+        for slot in slots:
+            self.b.store(self.lanes.constant(0.0, self.real), slot)
+        return slots
 
-    def loads(self, rooms: Sequence[ir.Value]) -> list[ir.Value]:
-        return [self.b.load(room, typ=self.reals) for room in rooms]
+    def loads(self, slots: Sequence[ir.Value]) -> list[ir.Value]:
+        return [self.b.load(slot, typ=self.reals) for slot in slots]
 
     def transpose_quarters(self, vectors: Sequence[ir.Value]) -> list[ir.Value]:
         """Transpose every four lanes of four vectors as a 4×4 matrix: in pairs, then in pairs of pairs."""
