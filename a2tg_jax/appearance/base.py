@@ -192,8 +192,8 @@ class Appearance(NamedFields):
 
     def share(self, gaussians: Gaussians, num_shares: Array) -> tuple[Gaussians, Self]:
         """Return each row as one of num_shares [N] coincident copies that together look like it; traceable."""
-        opacities, scales = share(gaussians.logit_opacities, gaussians.log_scales, num_shares)
-        return dataclasses.replace(gaussians, logit_opacities=opacities, log_scales=scales), self
+        logits, log_scales = share(gaussians.logit_opacities, gaussians.log_scales, num_shares)
+        return dataclasses.replace(gaussians, logit_opacities=logits, log_scales=log_scales), self
 
     def limit_opacities(self, gaussians: Gaussians, most: Array) -> tuple[Gaussians, Self]:
         """Return Gaussians and appearance of splats no more opaque than `most`; traceable."""
@@ -315,8 +315,8 @@ def array_fields(node: Any) -> list[str]:
 
 def own_fields(appearance: Any) -> list[str]:
     """Return the names of the array fields that a subclass adds."""
-    shared = {field.name for field in dataclasses.fields(Appearance)}
-    return [name for name in array_fields(appearance) if name not in shared]
+    inherited = {field.name for field in dataclasses.fields(Appearance)}
+    return [name for name in array_fields(appearance) if name not in inherited]
 
 
 def gaussian_cutoff(peak: Array) -> Array:

@@ -58,7 +58,7 @@ class Billboards(Appearance):
 
     def atlas(self) -> tuple[Array, TextureRegion]:
         """Return the texels [T, 4], RGB in (0, 1) and alpha, and the places of the pictures."""
-        (bucket,) = self._bucket()
+        bucket = self._bucket()
         row = self._rows()
         texels = jnp.concatenate([jax.nn.sigmoid(bucket[..., :3]), bucket[..., 3:]], axis=-1)
         first = row * jnp.int32(self.side**2)
@@ -85,7 +85,7 @@ class Billboards(Appearance):
 
     def cutoff(self, opacities: Array) -> Array:
         """Return the circle around the picture, border included."""
-        (bucket,) = self._bucket()
+        bucket = self._bucket()
         peaks = jax.lax.stop_gradient(jnp.max(bucket[..., 3], axis=(1, 2)))[self._rows()]
         # Pictures fade out over one texel beyond ±1; a corner is at ρ = u² + v².
         half_side = 1 + 2 / (self.side - 1)
@@ -130,13 +130,13 @@ class Billboards(Appearance):
 
     def limit_opacities(self, gaussians: Gaussians, most: Array) -> tuple[Gaussians, "Billboards"]:
         """Fade pictures whose mean alpha is larger than `most`, by one factor each."""
-        (bucket,) = self._bucket()
+        bucket = self._bucket()
         fading = jnp.minimum(safe_divide(jnp.asarray(most, bucket.dtype), self._means(), 1.0), 1.0)
         return gaussians, self._with_alpha(lambda alpha: alpha * fading[:, None, None])
 
     def share(self, gaussians: Gaussians, num_shares: Array) -> tuple[Gaussians, "Billboards"]:
         """Fade pictures so that n coincident copies are together as opaque as one was; scales stay unchanged."""
-        (bucket,) = self._bucket()
+        bucket = self._bucket()
         # One share leaves the rows of padding unchanged.
         num_shares = jnp.pad(num_shares, (0, bucket.shape[0] - gaussians.num), constant_values=1)
         exponents = (1 / num_shares.astype(bucket.dtype))[:, None, None]
@@ -153,12 +153,12 @@ class Billboards(Appearance):
         if gaussians.num:
             self._bucket()
 
-    def _bucket(self) -> tuple[Array]:
+    def _bucket(self) -> Array:
         """Return the one bucket of pictures. Raise ValueError if there are several sizes."""
         sizes = None if self.pictures is None else self.pictures.bucket_sizes
         if self.pictures is None or sizes != ((self.side, self.side),):
             raise ValueError(f"pictures must all have {self.side} × {self.side} texels; got sizes {sizes}")
-        return self.pictures.buckets  # type: ignore[return-value]
+        return self.pictures.buckets[0]
 
     def _rows(self) -> Array:
         assert self.pictures is not None
@@ -166,10 +166,10 @@ class Billboards(Appearance):
 
     def _means(self) -> Array:
         """Return the mean alphas [capacity]."""
-        return jnp.mean(self._bucket()[0][..., 3], axis=(1, 2))
+        return jnp.mean(self._bucket()[..., 3], axis=(1, 2))
 
     def _with_alpha(self, change: Callable[[Array], Array]) -> "Billboards":
-        (bucket,) = self._bucket()
+        bucket = self._bucket()
         bucket = bucket.at[..., 3].set(change(bucket[..., 3]))
         assert self.pictures is not None
         return dataclasses.replace(self, pictures=dataclasses.replace(self.pictures, buckets=(bucket,)))

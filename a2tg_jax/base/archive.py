@@ -54,7 +54,8 @@ def read_archive(
     # Naming a run folder instead of its model is a likely mistake.
     if path.is_dir():
         models = sorted(path.glob("models/*.npz"))
-        raise ValueError(f"{path}: is a folder; name a file{f', such as {models[0]}' if models else ''}")
+        such_as = f", such as {models[0]}" if models else ""
+        raise ValueError(f"{path}: is a folder; name a file{such_as}")
     check_exists(path, format)
     try:
         arrays = read_npz(path, lambda name: name == HEADER or names is None or name in names)

@@ -29,8 +29,8 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path next to `path` to write to, and rename it to `path` if the block succeeds.
 
     If the process is killed or the machine loses power, the old file or none is left, never half of one. Missing parent
-    folders are made. A link stays, and the file that it leads to is written. Partial files of the same file that killed
-    processes left over are deleted.
+    folders are made. A link stays, and the file that it leads to is written. Partial files of it, left over by killed
+    processes, are deleted.
 
     Raises:
       OSError: from the block, or if `file_to_write` refuses the path. The error of a full disk names the file.

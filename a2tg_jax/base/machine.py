@@ -88,7 +88,10 @@ def control_groups(root: Path, controller: str) -> list[Path]:
     except OSError:
         return []
     folders: list[Path] = []
-    for _, controllers, path in (line.split(":", 2) for line in lines if line.count(":") >= 2):
+    for line in lines:
+        if line.count(":") < 2:
+            continue
+        _, controllers, path = line.split(":", 2)
         # Version 2 has one hierarchy, which is listed without controllers.
         if not controllers or controller in controllers.split(","):
             top = root / "sys/fs/cgroup" / controllers

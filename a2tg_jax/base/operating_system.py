@@ -96,7 +96,7 @@ def c_library() -> Any:
     """Return the C library, by ctypes; None if there is none, as on Windows."""
     try:
         return ctypes.CDLL(None)
-    except (OSError, TypeError):  # Windows has no such library.
+    except (OSError, TypeError):
         return None
 
 

@@ -86,8 +86,7 @@ def open_regular(path: str | os.PathLike[str], most_bytes: int = MOST_ARRAY_BYTE
     if not stat.S_ISREG(status.st_mode):
         reason = _refusal(path)
     elif status.st_size > most_bytes:
-        size = f"{status.st_size:,} bytes, and {most_bytes:,}"
-        reason = f"{path}: has {size} are the most that such a file may have"
+        reason = f"{path}: has {status.st_size:,} bytes, and {most_bytes:,} are the most that such a file may have"
     elif status.st_size < MOST_POINTER_BYTES and file.peek().startswith(LFS_POINTER):
         reason = f"{path}: is a pointer of git-lfs, a text that replaces the file; run `git lfs pull` in its repository"
     else:

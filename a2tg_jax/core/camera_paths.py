@@ -205,12 +205,12 @@ def turntable(cameras: Sequence[Camera], num_frames: int, up: np.ndarray | None 
             break
     side = across / np.linalg.norm(across)
     first = cameras[0]
-    place = distances.mean()
+    radius = distances.mean()
     frames = []
     for angle in np.arange(num_frames) * (2 * np.pi / num_frames):
         heading = np.cos(angle) * side + np.sin(angle) * np.cross(up, side)
         outward = np.cos(elevation) * heading + np.sin(elevation) * up
-        viewmat = jnp.asarray(looking(subject + place * outward, -outward, -up), first.viewmat.dtype)
+        viewmat = jnp.asarray(looking(subject + radius * outward, -outward, -up), first.viewmat.dtype)
         frames.append(Camera(viewmat, first.K, first.width, first.height))
     return frames
 

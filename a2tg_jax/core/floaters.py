@@ -60,7 +60,7 @@ def floater_scores(
         seen = ahead[is_seen]
         octaves = np.log2(depth[seen])
         cell = (column[is_seen] / width * CELLS).astype(int) + CELLS * (row[is_seen] / height * CELLS).astype(int)
-        # A cell of few is mostly floaters.
+        # In a cell of few Gaussians most are floaters, so the mean of the picture counts as well.
         picture = FEWEST * octaves.mean() if len(octaves) else 0.0
         typical = (np.bincount(cell, octaves) + picture) / (np.bincount(cell) + FEWEST)
         num_views[seen] += 1

@@ -29,7 +29,7 @@ from a2tg_jax.core.checks import (
 from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.numerics import safe_divide, safe_sqrt
 from a2tg_jax.core.pytree import pytree
-from a2tg_jax.core.sh import NUM_BASES
+from a2tg_jax.core.sh import NUM_BASES, SH_C0
 
 LARGEST_LOG_SCALE = math.log(LARGEST_NUMBER)
 INITIAL_OPACITY = 0.1
@@ -39,7 +39,6 @@ NO_ROW_LOG_SCALE = -10.0  # an opacity of 4.5e-5, far below 1/255
 """Log-scales and opacity logit of spare rows."""
 COLOR_SLACK = 1e-3
 """Rounding by which colours may leave [0, 1]."""
-SH_C0 = 0.28209479177387814  # 1/(2·√π), the value of the basis function of degree 0
 LEAST_INITIAL_COLOR = 0.05
 """Least initial colour. At and below 0 the renderer's max(colour, 0) has no gradient that would raise it."""
 
@@ -287,7 +286,7 @@ QUADRATURE_STEPS = 32
 
 
 def share(logit_opacities: Array, log_scales: Array, num_shares: Array) -> tuple[Array, Array]:
-    """Return opacity [N] and size [N, 2] of `num_shares` coincident copies that replace one Gaussian.
+    """Return logit opacities [N] and log-scales [N, 2] of `num_shares` coincident copies that replace one Gaussian.
 
     o' = 1 - (1 - o)^(1/n), clamped to [0.005, 1 - 2⁻²³], keeps the opacity at the centre; the scales, multiplied by o /
     S(o', n), keep the integral of the opacity along a line through it. Rows with n = 1 stay unchanged.

@@ -49,8 +49,10 @@ def adam_init(params: object) -> AdamState:
       ValueError: if a leaf holds no floats, naming it.
     """
     _check_floats(params)
-    zeros = jax.tree.map(jnp.zeros_like, params)
-    return AdamState(mu=zeros, nu=jax.tree.map(jnp.zeros_like, params), count=jnp.zeros((), jnp.int32))
+    mu = jax.tree.map(jnp.zeros_like, params)
+    # Not the arrays of `mu` again: a buffer can be donated only once.
+    nu = jax.tree.map(jnp.zeros_like, params)
+    return AdamState(mu, nu, count=jnp.zeros((), jnp.int32))
 
 
 def adam_update(

@@ -105,19 +105,16 @@ def pytree(cls: Any = None, /, **options: Any) -> Any:
     made = dataclasses.dataclass(frozen=True, **options)(cls)
     made.__eq__ = own_equality
     _name_replace(made)
-    kinds: dict[str, list[str]] = {"static": [], "beside": [], "dynamic": []}
-    for field in dataclasses.fields(made):
-        kind = next((kind for kind in ("static", "beside") if field.metadata.get(kind)), "dynamic")
-        kinds[kind].append(field.name)
-    dynamic = tuple(kinds["dynamic"])
-    fixed = tuple(kinds["static"])
+    fields = dataclasses.fields(made)
+    fixed = tuple(field.name for field in fields if field.metadata.get("static"))
+    common = {field.name for field in fields if field.metadata.get("shared")}
+    left_out: dict[str, object] = {}
+    for field in fields:
+        if field.metadata.get("beside"):
+            left_out[field.name] = None if field.default is dataclasses.MISSING else field.default
+    dynamic = tuple(field.name for field in fields if field.name not in {*fixed, *left_out})
     # For errors, which name a leaf by its path, such as params.gaussians.means.
     keys = tuple(jax.tree_util.GetAttrKey(name) for name in dynamic)
-    common = {field.name for field in dataclasses.fields(made) if field.metadata.get("shared")}
-    left_out: dict[str, object] = {}
-    for field in dataclasses.fields(made):
-        if field.name in kinds["beside"]:
-            left_out[field.name] = None if field.default is dataclasses.MISSING else field.default
 
     def flatten(node: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         values = node.__dict__

@@ -13,6 +13,7 @@ from a2tg_jax.core.numerics import factor_to, normalize
 
 NUM_BASES = (1, 4, 9, 16)
 """Number of bases of degrees 0 to the index."""
+SH_C0 = 0.28209479177387814  # 1/(2·√π), the value of the basis function of degree 0
 
 
 def sh_basis(directions: Array, num: int = 16) -> Array:
@@ -21,7 +22,7 @@ def sh_basis(directions: Array, num: int = 16) -> Array:
     x = directions[..., 0]
     y = directions[..., 1]
     z = directions[..., 2]
-    bases = [jnp.full_like(x, 0.28209479177387814)]
+    bases = [jnp.full_like(x, SH_C0)]
     if num > 1:
         bases += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
     if num > 4:

@@ -221,9 +221,10 @@ class Table(NamedFields):
         Padding is `padding` of the class, or C given numbers, such as zeros for moments."""
         places, capacities = plan_places(self.sizes[rows])
         bucket, row = _indices(self)
-        ends = ((bucket[rows], row[rows]), _indices(places))
+        old_and_new = ((bucket[rows], row[rows]), _indices(places))
         padding = padding or self.padding
-        return self.placed(_moved(type(self), self.buckets, ends, places.bucket_sizes, capacities, padding), places)
+        buckets = _moved(type(self), self.buckets, old_and_new, places.bucket_sizes, capacities, padding)
+        return self.placed(buckets, places)
 
     def nearest_places(self) -> Self:
         """Return the table with int32 buckets and rows, each moved to the nearest one that exists; traced.
@@ -335,7 +336,6 @@ def plan_places(
     row[order] = np.arange(len(sizes)) - starts
     sides = map(tuple, (codes[:, None] // weights % 64).tolist())
     needed: dict[Size, int] = dict(zip(sides, counts.tolist(), strict=True))
-    # Without Gaussians, one bucket of no blocks keeps the number of sides and the dtype.
     smallest = Shape(tuple(needed), tuple(map(bucket_capacity, needed.values())))
 
     def has_room(shape: Shape) -> bool:
@@ -343,6 +343,7 @@ def plan_places(
         return all(rows.get(size, 0) >= count for size, count in needed.items())
 
     if not needed:
+        # Without Gaussians, one bucket of no blocks keeps the number of sides and the dtype.
         shape = Shape(((0,) * sizes.shape[1],), (0,))
     elif room is not None and has_room(room):
         shape = room
@@ -351,8 +352,7 @@ def plan_places(
         fitting = [shape for shape in known if has_room(shape) and shape.num_elements <= most]
         shape = min(fitting, key=lambda shape: shape.num_elements, default=smallest)
     place = np.asarray([shape.sizes.index(size) for size in needed], np.int32)
-    buckets = (place[bucket] if len(place) else bucket).astype(np.int32)
-    return Places(jax.device_put(buckets), jax.device_put(row), shape.sizes), shape.capacities
+    return Places(jax.device_put(place[bucket]), jax.device_put(row), shape.sizes), shape.capacities
 
 
 def resize(
@@ -371,15 +371,15 @@ def resize(
     stay. They become 0 for blocks that are not `kept` [N]. `known` and `room` are as for `plan_places`.
     """
     places, capacities = plan_places(sizes, known, room)
-    ends = [_indices(table), _indices(places)]
-    kept_ends = ends
+    old_and_new = [_indices(table), _indices(places)]
+    kept_old_and_new = old_and_new
     if kept is not None:
         check_mask("kept", kept, (table.num,))
-        kept_ends = [(bucket[kept], row[kept]) for bucket, row in ends]
+        kept_old_and_new = [(bucket[kept], row[kept]) for bucket, row in old_and_new]
     kind = type(table)
 
-    def rebuilt(old: Table, ends: list[_Indices], padding: Sequence[float]) -> Table:
-        targets = _moved(kind, old.buckets, ends, places.bucket_sizes, capacities, padding)
+    def rebuilt(old: Table, old_and_new: list[_Indices], padding: Sequence[float]) -> Table:
+        targets = _moved(kind, old.buckets, old_and_new, places.bucket_sizes, capacities, padding)
         whole = kind.placed(targets, places)
         return partition(whole)[0] if old.bucket is None else whole  # Moments are floats only.
 
@@ -390,20 +390,20 @@ def resize(
             raise ValueError(f"moments must have the buckets of the table; got {leaf}")
         for index, (moment, blocks) in enumerate(zip(leaf.buckets, table.buckets, strict=True)):
             check_shape(f"moments.buckets[{index}]", moment, blocks.shape)
-        return rebuilt(leaf, kept_ends, (0.0,) * len(kind.padding))
+        return rebuilt(leaf, kept_old_and_new, (0.0,) * len(kind.padding))
 
     moments = jax.tree.map(rebuilt_moments, moments, is_leaf=lambda leaf: isinstance(leaf, kind))
-    return rebuilt(table, ends, kind.padding), moments
+    return rebuilt(table, old_and_new, kind.padding), moments
 
 
 def _moved(
-    kind: type[Table], buckets: Sequence[Any], ends: Sequence[_Indices], sizes: Sequence[Size],
+    kind: type[Table], buckets: Sequence[Any], old_and_new: Sequence[_Indices], sizes: Sequence[Size],
     capacities: Sequence[int], padding: Sequence[float],
 ) -> list[np.ndarray]:  # fmt: skip
     """Return new buckets of given sizes and capacities, with blocks moved from old to new (bucket, row)."""
     dtype = buckets[0].dtype if buckets else np.float32
     targets = [kind._padded(capacity, size, dtype, padding) for capacity, size in zip(capacities, sizes, strict=True)]
-    (old_bucket, old_row), (new_bucket, new_row) = ends
+    (old_bucket, old_row), (new_bucket, new_row) = old_and_new
     for index, bucket in enumerate(buckets):
         from_here = np.flatnonzero(old_bucket == index)
         # Blocks with a side of 0 have nothing to move.

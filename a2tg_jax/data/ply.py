@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from a2tg_jax.base.regular_files import is_regular, open_regular
 from a2tg_jax.base.text import shortened
-from a2tg_jax.core.gaussians import SH_C0
+from a2tg_jax.core.sh import SH_C0
 from a2tg_jax.data.assembly import PointCloud
 
 OLD_TYPES = ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")

@@ -21,8 +21,8 @@ from numpy.typing import ArrayLike
 
 from a2tg_jax import Camera, Gaussians, Model, RenderSettings, Textures, View, plan_render
 from a2tg_jax.appearance import in_words
-from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.core.origin import Color
+from a2tg_jax.core.sh import SH_C0
 from a2tg_jax.core.table import Group
 from a2tg_jax.finish.compaction import loss_on_views
 from a2tg_jax.model import check_is_model

@@ -22,8 +22,7 @@ from a2tg_jax.base.suffixes import check_suffix
 from a2tg_jax.base.text import shortened
 from a2tg_jax.core.checks import check_int, check_literal
 from a2tg_jax.core.config_json import config_from_dict
-from a2tg_jax.core.gaussians import SH_C0
-from a2tg_jax.core.sh import NUM_BASES
+from a2tg_jax.core.sh import NUM_BASES, SH_C0
 from a2tg_jax.io.columns import Ends, dequantised, ends_of, quantised
 from a2tg_jax.io.gltf_container import Builder, Document, mesh_nodes, scene_of_one
 from a2tg_jax.io.model_rows import Rows, check_encodable, model_of, rows_of_model

@@ -29,8 +29,8 @@ from a2tg_jax.appearance.parts import LEAST_OPACITY
 from a2tg_jax.base.atomic import write_whole
 from a2tg_jax.base.regular_files import check_exists, expanded, open_regular, reading
 from a2tg_jax.base.suffixes import check_suffix
-from a2tg_jax.core.gaussians import SH_C0, rotation_matrices
-from a2tg_jax.core.sh import NUM_BASES
+from a2tg_jax.core.gaussians import rotation_matrices
+from a2tg_jax.core.sh import NUM_BASES, SH_C0
 from a2tg_jax.data.other_runs import model_hint
 from a2tg_jax.data.ply import OFFSET, RGB, ROTATION, SH_DEGREE0, PlyFile, largest_color
 from a2tg_jax.io.columns import logits_of

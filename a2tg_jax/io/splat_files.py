@@ -19,8 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from a2tg_jax import Model
-from a2tg_jax.core.gaussians import SH_C0
-from a2tg_jax.core.sh import NUM_BASES
+from a2tg_jax.core.sh import NUM_BASES, SH_C0
 from a2tg_jax.io.other_programs import LEAST_SCALE, Ellipsoids, PlacedSplats, model_of_splats, to_bytes
 
 # .splat

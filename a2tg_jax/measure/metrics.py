@@ -31,7 +31,7 @@ LPIPS_MIN_SIDE = 32  # A stride of 4 and two poolings, or of 2 and three, must l
 
 
 def psnr(image: Array, target: Array, mask: Array | None = None) -> Array:
-    """Peak signal-to-noise ratio in dB, -10·log10(mean squared error); infinite for equal images.
+    """Return the peak signal-to-noise ratio in dB, -10·log10(mean squared error); infinite for equal images.
 
     Args:
       image: [H, W, 3], clipped to [0, 1] first.
@@ -42,7 +42,7 @@ def psnr(image: Array, target: Array, mask: Array | None = None) -> Array:
       A scalar in dB; higher is better.
 
     Raises:
-      ValueError: if the shapes differ, an image is in 0..255.
+      ValueError: if the shapes differ, or an image is in 0..255.
 
     Examples:
       >>> image, target = jnp.zeros((16, 16, 3)), jnp.full((16, 16, 3), 0.1)
@@ -56,7 +56,7 @@ def psnr(image: Array, target: Array, mask: Array | None = None) -> Array:
 
 
 def ssim(image: Array, target: Array, mask: Array | None = None) -> Array:
-    """Structural similarity of the images clipped to [0, 1] (Wang et al., 2004), in windows of 11 × 11 pixels.
+    """Return the structural similarity (Wang et al., 2004) of the images clipped to [0, 1], in windows of 11 × 11.
 
     Args:
       image: [H, W, 3], sides of at least 11 pixels.
@@ -115,7 +115,7 @@ def load_lpips(path: str | os.PathLike[str]) -> LpipsWeights:
 def lpips(
     image: Array, target: Array, weights: LpipsWeights | str | os.PathLike[str], mask: Array | None = None
 ) -> Array:
-    """Learned perceptual distance (LPIPS v0.1, Zhang et al., 2018) of the images clipped to [0, 1]; 0 is equal.
+    """Return the learned perceptual distance (LPIPS v0.1, Zhang et al., 2018) of the images clipped to [0, 1].
 
     Args:
       image: [H, W, 3], sides of at least 32 pixels.
@@ -155,7 +155,7 @@ def lpips(
 
 
 def parameter_bytes(gaussians: Gaussians, textures: Textures | None = None) -> int:
-    """Reported memory in bytes: 232 a Gaussian (of degree 3) and 16 a texel, 1×1 textures counted, padding not.
+    """Return the reported bytes: 232 a Gaussian (of degree 3) and 16 a texel, 1×1 textures counted, padding not.
 
     Args:
       gaussians: the live Gaussians only.
@@ -263,7 +263,7 @@ def _conv_relu(arrays: Mapping[str, np.ndarray], name: str, x: Array, stride: in
 
 
 def _max_pool(x: Array, is_ceil: bool = False) -> Array:
-    """3×3 maximum at stride 2; `is_ceil` keeps the last window that only starts inside the image."""
+    """Return 3×3 maxima at stride 2; `is_ceil` keeps the last window that only starts inside the image."""
     # As PyTorch's ceil_mode; −inf padding never wins.
     padding = [(0, (size - 3) % 2 if is_ceil else 0) for size in x.shape[1:3]]
     return jax.lax.reduce_window(x, -jnp.inf, jax.lax.max, (1, 3, 3, 1), (1, 2, 2, 1), [(0, 0), *padding, (0, 0)])

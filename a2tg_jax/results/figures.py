@@ -19,7 +19,7 @@ from matplotlib.ticker import MaxNLocator
 from a2tg_jax import Camera, History, Model, Renderer, RenderOutput, RenderSettings, texture_arrays
 from a2tg_jax.base.atomic import replacing
 from a2tg_jax.base.text import PROGRAM
-from a2tg_jax.core.gaussians import SH_C0
+from a2tg_jax.core.sh import SH_C0
 from a2tg_jax.data.colmap import read_cameras_and_points
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.images import checkered, save_picture, to_uint8

@@ -16,10 +16,11 @@ from jax.sharding import Mesh
 
 from a2tg_jax.appearance import Appearance, project_appearance
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.gaussians import SH_C0, Gaussians
+from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.optim import AdamState, OptStep, adam_init, adam_update
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.pytree import combine, partition, pytree
+from a2tg_jax.core.sh import SH_C0
 from a2tg_jax.events import Change, EventInfo, Now, Seen, StepEvent, read_probe
 from a2tg_jax.model import Model
 from a2tg_jax.parallel import in_views, with_rows_divided, with_rows_of_views_divided

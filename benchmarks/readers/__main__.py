@@ -21,7 +21,7 @@ from PIL import Image
 from scipy.spatial import cKDTree
 
 from a2tg_jax import Gaussians, Origin, Similarity, load_splats, save_splats
-from a2tg_jax.core.gaussians import SH_C0
+from a2tg_jax.core.sh import SH_C0
 from a2tg_jax.finish.baking import pictures
 from a2tg_jax.io.other_programs import upright
 from benchmarks.readers.browser import Camera, draw
