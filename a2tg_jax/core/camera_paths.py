@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from a2tg_jax.core.cameras import (
     Camera,
+    camera_centers,
     check_camera,
     checked_cameras,
     intrinsics,
@@ -20,7 +21,6 @@ from a2tg_jax.core.cameras import (
     viewmat_of_axes,
 )
 from a2tg_jax.core.checks import check_int
-from a2tg_jax.core.similarity import camera_centers
 
 MIN_AXIS_SPREAD = 1e-3
 """Smallest eigenvalue of the mean of I - d·dᵀ (about the squared angle between axes) that fixes a point."""

@@ -263,6 +263,12 @@ def viewmat_of_axes(rotation: np.ndarray, center: np.ndarray) -> np.ndarray:
     return viewmat
 
 
+def camera_centers(viewmats: np.ndarray) -> np.ndarray:
+    """Return the positions [V, 3] of cameras given as rigid world-to-camera matrices [V, 4, 4]: c = -Rcᵀ·t."""
+    centers: np.ndarray = np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3])
+    return -centers
+
+
 def pinhole_pixels(points: np.ndarray, K: np.ndarray) -> np.ndarray:
     """Return x and y [P, 2] in pixels of points [P, 3] in front of a pinhole camera, in its frame."""
     projected = points @ K.T

@@ -81,12 +81,6 @@ def check_similarity(similarity: Similarity, what: str) -> None:
         raise ValueError(f"{what} must have a rotation; got {np.asarray(rotation).tolist()}")
 
 
-def camera_centers(viewmats: np.ndarray) -> np.ndarray:
-    """Return the positions [V, 3] of cameras given as rigid world-to-camera matrices [V, 4, 4]: c = -Rcᵀ·t."""
-    centers: np.ndarray = np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3])
-    return -centers
-
-
 NUM_DIRECTIONS = 64
 SH_DEGREES = (slice(0, 1), slice(1, 4), slice(4, 9), slice(9, 16))
 

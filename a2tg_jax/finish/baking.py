@@ -22,11 +22,11 @@ from a2tg_jax import Camera, Gaussians, Gaussians2d, Model, Renderer, Scene, Sim
 from a2tg_jax.appearance.parts import MAX_DEGREE, curves_of, falloff_of, nearest_gaussians, texel_coordinates
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.camera_paths import without_outlying
+from a2tg_jax.core.cameras import camera_centers
 from a2tg_jax.core.gaussians import floats_per_gaussian, logit, rotation_matrices
 from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.origin import Color
 from a2tg_jax.core.sh import NUM_BASES, SH_C0
-from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.data.assembly import scene_scale
 from a2tg_jax.finish.shrinking import fewest_texels, texel_weights
 from a2tg_jax.host.training_bar import ProgressBar
