@@ -99,7 +99,8 @@ def test_compress_with_tuning(run, tmp_path, monkeypatch, capsys):
     assert cli.main([*TUNE, str(run.path), "--out", str(tuned), "--max-loss", "0.02"]) == 0
     printed = capsys.readouterr().out
     scene = read_record(run).scene.load()
-    assert re.search(r"\ntuning 1 of up to 4: .*, about 0:\d\d:\d\d left; \d+ MB of memory\n", printed)  # Nothing grows.
+    # Nothing grows.
+    assert re.search(r"\ntuning 1 of up to 4: .*, about 0:\d\d:\d\d left; \d+ MB of memory\n", printed)
     assert "then training up to" in printed and "\ntuned 1 " in printed and "\ntuned 1: means " in printed
     before, after = (
         evaluate(scene.train, m).psnr for m in (load_model(run.model("a2tg-textures")), load_compact(tuned))
