@@ -4,6 +4,7 @@ Names are imported at their first use, so that `import a2tg_jax` costs little mo
 """
 
 import importlib.util
+import sys
 from typing import Any
 
 import lazy_loader
@@ -18,8 +19,9 @@ def __getattr__(name: str) -> Any:
     # The stub lists names, not modules.
     if name not in __all__ and importlib.util.find_spec(f"{__name__}.{name}") is not None:
         return importlib.import_module(f"{__name__}.{name}")
-    # Most names start JAX.
-    importlib.import_module(f"{__name__}.base.machine").check_ulimits()
+    # Most names start JAX. The command line checks by itself, for commands that do.
+    if f"{__name__}.cli" not in sys.modules:
+        importlib.import_module(f"{__name__}.base.machine").check_ulimits()
     return _import_name(name)
 
 
