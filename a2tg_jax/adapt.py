@@ -185,13 +185,14 @@ class Upscale(HostEvent):
             # then of both axes.
             left = rule["budget_bytes"] - _bytes_between(sizes, grown)
             for anisotropic in (self.anisotropic, False):
-                mask = np.ones(1, bool)
-                while mask.any():
-                    last = grown
-                    proposed = propose(last, anisotropic)
-                    mask = select(averages[:num], last, proposed, budget_bytes=left)
-                    grown = np.where(mask[:, None], proposed, last)
-                    left -= _bytes_between(last, grown)
+                while True:
+                    proposed = propose(grown, anisotropic)
+                    mask = select(averages[:num], grown, proposed, budget_bytes=left)
+                    if not mask.any():
+                        break
+                    larger = np.where(mask[:, None], proposed, grown)
+                    left -= _bytes_between(grown, larger)
+                    grown = larger
         new_sizes[:num] = grown
         kept = None if self.moments == "copied" else (new_sizes == old_sizes).all(axis=1)
         rebuilt = reallocate(textures, new_sizes, moments, tuple(due.shapes), kept, textures.shape)

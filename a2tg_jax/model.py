@@ -399,8 +399,8 @@ def plain_gaussians(gaussians: Gaussians | Model, *, keeps_shapes: bool = False)
     They have their own opacities, and all spherical harmonics of the model.
 
     Args:
-      gaussians: as in `save_ply`.
-      keeps_shapes: the file also keeps kernel shapes. If not, each kernel becomes the nearest Gaussian.
+      gaussians: Gaussians or a model.
+      keeps_shapes: whether the caller keeps the shapes of kernels; otherwise each becomes the nearest Gaussian.
     """
     if isinstance(gaussians, Model):
         model = gaussians.live

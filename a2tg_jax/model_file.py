@@ -19,7 +19,7 @@ from a2tg_jax import appearance as built_in
 from a2tg_jax.appearance import Appearance, Bands, Exponents, Texture, TextureOptions, appearance_for
 from a2tg_jax.appearance.base import PARTS, template_of
 from a2tg_jax.appearance.files import arrays_of, with_arrays
-from a2tg_jax.base.archive import read_archive, write_archive
+from a2tg_jax.base.archive import arrays_below, read_archive, write_archive
 from a2tg_jax.base.regular_files import reading
 from a2tg_jax.base.suffixes import check_suffix
 from a2tg_jax.base.text import shortened
@@ -100,16 +100,11 @@ def load_model(path: str | os.PathLike[str], *, appearances: Sequence[type[Appea
         check_gaussians(gaussians)
         gaussians = jax.tree.map(jnp.asarray, gaussians)
         appearance = appearance_from_dict(header["appearance"], appearances)
-        origin = origin_of(header["origin"], _below(ORIGIN, arrays)) if "origin" in header else None
-        appearance = with_arrays(appearance, _below(APPEARANCE, arrays), gaussians.sh_degree)
+        origin = origin_of(header["origin"], arrays_below(ORIGIN, arrays)) if "origin" in header else None
+        appearance = with_arrays(appearance, arrays_below(APPEARANCE, arrays), gaussians.sh_degree)
         model = Model(gaussians, appearance, background=background_of(header), origin=origin)
         check_model(model)
         return model
-
-
-def _below(prefix: str, arrays: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arrays whose names have a prefix, by the rest of their names."""
-    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
 
 
 def number_in_file(path: str | os.PathLike[str]) -> int:
@@ -253,5 +248,5 @@ def origin_of(data: Mapping[str, object], arrays: Mapping[str, Any]) -> Origin:
     if up is not None:
         up = np.asarray(up, np.float64)
         check_shape(ORIGIN + "up", up, (3,))
-    corrections = _below(CORRECTIONS, arrays)
+    corrections = arrays_below(CORRECTIONS, arrays)
     return Origin(**checked, names=tuple(names), transform=world, corrections=corrections, up=up)

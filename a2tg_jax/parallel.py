@@ -160,11 +160,11 @@ def num_processes(mesh: Mesh | None) -> int:
     return 1 if mesh is None else len({device.process_index for device in mesh.devices.flat})
 
 
-def any_process(mesh: Mesh | None, is_asked: bool) -> bool:
-    """Return whether `is_asked` holds in any process."""
+def any_process(mesh: Mesh | None, is_here: bool) -> bool:
+    """Return whether `is_here` holds in any process."""
     if num_processes(mesh) == 1:
-        return is_asked
-    return bool(np.any(multihost_utils.process_allgather(np.asarray(is_asked))))
+        return is_here
+    return bool(np.any(multihost_utils.process_allgather(np.asarray(is_here))))
 
 
 def broadcast(data: bytes) -> bytes:

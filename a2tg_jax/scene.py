@@ -23,6 +23,9 @@ LONGEST_PREVIEW = 800
 """Longest side in pixels of the picture of a view in a notebook."""
 NUM_THUMBNAILS = 8
 
+Kind = tuple[int, int, int]
+"""Height, width and lens of a view."""
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class View(NamedFields):
@@ -181,7 +184,7 @@ def check_view(view: View) -> None:
         raise ValueError(f"the mask of view {view.name} excludes every pixel: leave the view out or fix its mask")
 
 
-def kinds_of(views: Sequence[View]) -> list[tuple[int, int, int]]:
+def kinds_of(views: Sequence[View]) -> list[Kind]:
     """Return height, width and lens of each view. Lens 0 is a pinhole; others are numbered in order of appearance."""
     numbers = {key: number for number, key in enumerate(rays_of_lenses(views), 1)}
     return [(*view.picture.size, numbers.get(id(view.camera.rays), 0)) for view in views]
@@ -200,7 +203,7 @@ def ray_bytes(views: Sequence[View]) -> int:
 
 def views_by_kind(views: Sequence[View]) -> list[list[View]]:
     """Return the views of each image size and lens, both in order of appearance."""
-    groups: dict[tuple[int, int, int], list[View]] = {}
+    groups: dict[Kind, list[View]] = {}
     for kind, view in zip(kinds_of(views), views, strict=True):
         groups.setdefault(kind, []).append(view)
     return list(groups.values())

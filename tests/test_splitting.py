@@ -13,7 +13,7 @@ from test_mcmc import random_gaussians
 
 import a2tg_jax as a2tg
 from a2tg_jax import AdamState, GradientStatistics, Model, Seen, SplitByGradient, adam_init, partition
-from a2tg_jax.densify.splitting import SplitStatistics, draw_distinct_hosts, draw_weights, logits_of_halves, split_rows
+from a2tg_jax.densify.splitting import SplitStatistics, draw_distinct_hosts, host_weights, logits_of_halves, split_rows
 from a2tg_jax.mcmc import plan_growth, plan_relocation
 
 NUM, LIVE = 400, 300
@@ -40,7 +40,7 @@ def test_hosts_are_drawn_by_gradient_and_size():
     model, _, statistics = some_state()
     scales = np.asarray(model.gaussians.scales)
     wanted = np.asarray(statistics.gradients.total) / 3 * np.sqrt(scales[:, 0] * scales[:, 1])
-    np.testing.assert_allclose(draw_weights(model, statistics), wanted, rtol=1e-5)
+    np.testing.assert_allclose(host_weights(model, statistics), wanted, rtol=1e-5)
     # The frequencies of a single draw are those of the weights, whatever the opacities.
     grown = jax.jit(
         lambda key: plan_growth(
@@ -85,7 +85,7 @@ def test_draws_follow_the_weights_of_those_that_are_left():
 @pytest.mark.parametrize("seed", range(2))
 def test_hosts_and_copies_become_halves(seed):
     model, moments, statistics = some_state(seed)
-    weights = draw_weights(model, statistics)
+    weights = host_weights(model, statistics)
     moves = plan_growth(KEY, model.gaussians.opacities, model.num_live, NUM, 330, by_weight(weights))
     after, new_moments, new_statistics = split_rows(jax.random.key(1), moves, model, moments, statistics)
     assert int(after.num_live) == 330
@@ -148,7 +148,7 @@ def test_sizes_on_the_screen_are_the_largest_of_the_views_that_show_a_splat():
 def test_the_dead_are_moved_onto_halves():
     model, moments, statistics = some_state()
     is_dead = (np.asarray(model.gaussians.opacities) < 0.005) & (np.arange(NUM) < LIVE)
-    moves = plan_relocation(KEY, model.gaussians.opacities, model.num_live, by_weight(draw_weights(model, statistics)))
+    moves = plan_relocation(KEY, model.gaussians.opacities, model.num_live, by_weight(host_weights(model, statistics)))
     after, _, _ = split_rows(jax.random.key(1), moves, model, moments, statistics)
     assert int(after.num_live) == LIVE and is_dead.sum() == 30
     assert np.asarray(after.gaussians.opacities)[:LIVE].min() > 0.05

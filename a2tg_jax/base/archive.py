@@ -81,3 +81,8 @@ def read_archive(
 def read_archive_header(path: str | os.PathLike[str], *, format: str = FORMAT) -> dict[str, Any]:
     """Return the header, without reading the arrays. Raises as `read_archive` does."""
     return read_archive(path, format=format, names=())[0]
+
+
+def arrays_below(prefix: str, arrays: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arrays whose names have a prefix, by the rest of their names."""
+    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}

@@ -192,14 +192,13 @@ class PruneFloaters(_Pruning):
 
     def apply(self, due: Due, model: Model, moments: AdamState, state: object) -> Change:
         num = model.num
-        means = np.asarray(model.gaussians.means)[: model.num]
         is_kept = np.ones(num, bool)
         if self.min_views:
             num_views = shown_in(model, due.views, self.least).num_views[:num]
             # With fewer training views than that, no Gaussian would be kept.
             is_kept = num_views >= min(self.min_views, len(due.views))
         if self.near:
-            is_kept &= ~are_near(means, due.views, self.near)
+            is_kept &= ~are_near(np.asarray(model.gaussians.means)[:num], due.views, self.near)
         if is_kept.sum() < LEAST_LEFT:
             warnings.warn(
                 f"no floaters are pruned, because {is_kept.sum()} of {num:,} Gaussians would be left, and training "

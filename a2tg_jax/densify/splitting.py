@@ -2,7 +2,7 @@
 
 3DGS-MCMC (`mcmc`) draws hosts by opacity and puts copies at the host's position. They separate slowly, and not where
 detail is missing. Here the weight of a host is the change of the loss by a move of its own size. Host and copies become
-halves, each at a point drawn from the host and 1.6 times smaller, as in adaptive density control (`densify`).
+halves, each at a point drawn from the host and 1.6 times smaller, as in adaptive density control (`clone_split`).
 
 The low-pass filter draws every splat at least as large as itself. Two halves of a smaller splat that kept its opacity
 would cover the same pixels and be about twice as opaque together, whereas two halves of a large splat cover 2/1.6² =
@@ -65,19 +65,19 @@ class SplitByGradient(FillingMcmc):
     def apply(self, now: Now, model: Model, moments: AdamState, state: SplitStatistics) -> Change:
         to_move, to_add, to_split = jax.random.split(now.keys[0], 3)
         num_live = model.live_count
-        draw = functools.partial(draw_distinct_hosts, draw_weights(model, state))
+        draw = functools.partial(draw_distinct_hosts, host_weights(model, state))
         moves = plan_relocation(to_move, model.appearance.opacities(model.gaussians), num_live, draw)
         model, moments, state = split_rows(to_split, moves, model, moments, state)
         cap = min(self.cap, model.gaussians.num)
         least = self.least(now, num_live)
         # Weights again, because moved rows are smaller and share their statistic.
-        draw = functools.partial(draw_distinct_hosts, draw_weights(model, state))
+        draw = functools.partial(draw_distinct_hosts, host_weights(model, state))
         moves = plan_growth(to_add, model.appearance.opacities(model.gaussians), num_live, cap, least, draw)
         model, moments, state = split_rows(now.keys[1], moves, model, moments, state)
         return Change(model, moments, state, EventInfo(is_possible=moves.info.has_hosts))
 
 
-def draw_weights(model: Model, state: SplitStatistics) -> Array:
+def host_weights(model: Model, state: SplitStatistics) -> Array:
     """Return [N] weights of hosts: average gradient by position, times the size."""
     return state.gradients.average() * model.gaussians.sizes + LEAST_WEIGHT
 

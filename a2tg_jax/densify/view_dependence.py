@@ -155,16 +155,15 @@ def without_idle(table: Coefficients, base_degree: int, idle: float) -> np.ndarr
     """
     degrees = degrees_of_sizes(table.sizes, base_degree)
     for blocks, owners in zip(table.buckets, table.owners, strict=True):
-        if blocks.size:
-            rows = np.asarray(owners)
-            values = np.asarray(blocks)
-            is_used = rows < table.num
-            rows = rows[is_used]
-            values = values[is_used]
-            # All blocks of a bucket are of one degree.
-            last = floats_of_band(int(degrees[rows[0]])) // 3 if len(rows) else 0
-            energy = np.square(values[:, values.shape[1] - last :]).sum(axis=(1, 2)) / (12 * np.pi)
-            degrees[rows[energy < idle**2]] -= 1
+        rows = np.asarray(owners)
+        is_used = rows < table.num
+        rows = rows[is_used]
+        if not blocks.size or not len(rows):
+            continue
+        # All blocks of a bucket are of one degree.
+        last = floats_of_band(int(degrees[rows[0]])) // 3
+        energy = np.square(np.asarray(blocks)[is_used][:, -last:]).sum(axis=(1, 2)) / (12 * np.pi)
+        degrees[rows[energy < idle**2]] -= 1
     return degrees
 
 

@@ -58,7 +58,9 @@ class Gaussians2d(TwoStages):
 
     @classmethod
     def presets(cls) -> dict[str, Self]:
-        short = cls.short_presets(*({"densify": CloneSplitPrune(cap=cap)} for cap in (QUICK_CAP, SMOKE_CAP)))
+        short = cls.short_presets(
+            {"densify": CloneSplitPrune(cap=QUICK_CAP)}, {"densify": CloneSplitPrune(cap=SMOKE_CAP)}
+        )
         return short | {"surfaces": cls(loss=LossConfig(normal_weight=0.2))}  # docs/meshes.md
 
 
@@ -90,7 +92,7 @@ class Gaussians2dMcmc(TwoStages):
 
     @classmethod
     def presets(cls) -> dict[str, Self]:
-        return cls.short_presets(*({"densify": Mcmc(cap=cap)} for cap in (QUICK_CAP, SMOKE_CAP)))
+        return cls.short_presets({"densify": Mcmc(cap=QUICK_CAP)}, {"densify": Mcmc(cap=SMOKE_CAP)})
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -130,6 +132,7 @@ class TexturedGaussians(TwoStages):
 
 
 AUTHORS_LOG_SCALES = 3e-3
+"""Learning rate of the logarithms of the scales in the authors' program of SuperGaussians."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -182,10 +185,6 @@ class SuperGaussians(TwoStages):
         return cls.short_presets(*(rates | {"densify": CloneSplitPrune(cap=cap)} for cap in (QUICK_CAP, SMOKE_CAP)))
 
 
-AUTHORS_LOSS = LossConfig(opacity_weight=0.01)
-AUTHORS_RATES = LearningRates(sh_degree0=5e-3, sh_rest=2.5e-4)
-
-
 @dataclasses.dataclass(frozen=True)
 class BillboardOptions(NamedFields):
     """The pictures of the billboards."""
@@ -213,8 +212,8 @@ class BBSplat(TwoStages):
 
     stage2_iterations: int = 2_000
     """Further iterations without densification; 0: none."""
-    loss: LossConfig = AUTHORS_LOSS
-    rates: LearningRates = AUTHORS_RATES
+    loss: LossConfig = LossConfig(opacity_weight=0.01)
+    rates: LearningRates = LearningRates(sh_degree0=5e-3, sh_rest=2.5e-4)
     densify: Mcmc = Mcmc(cap=160_000)
     """MCMC densification. A billboard of 16 × 16 texels has as many bytes as 18.6 plain Gaussians."""
     billboard: BillboardOptions = BillboardOptions()

@@ -13,11 +13,12 @@ from numpy.typing import DTypeLike
 
 from a2tg_jax.base.machine import default_device, num_threads
 from a2tg_jax.parallel import any_process, everywhere, of_views, views_here
-from a2tg_jax.scene import View, kinds_of, ray_bytes
+from a2tg_jax.scene import Kind, View, kinds_of, ray_bytes
 
-HOST_SHARE = 2**30
+CPU_ROOM = 2**30
+"""Largest size in bytes of photographs that all stay on the device, if it is a CPU."""
 DEVICE_SHARE = 0.25
-"""Photographs stay on the device while they take no more than this share of its memory; on a CPU, 1 GiB."""
+"""The same on a GPU, as a share of its memory."""
 ROOM_AHEAD = 2**28
 """Largest size of prepared batches in bytes."""
 MOST_AHEAD = 10
@@ -26,10 +27,6 @@ MOST_AHEAD = 10
 BYTES_PER_DEPTH = 4
 ALIGNMENT = 64
 """Alignment in bytes of memory that XLA adopts."""
-
-
-Kind = tuple[int, int, int]
-"""Image size and lens of a view (`scene.kinds_of`)."""
 
 
 class Photographs(NamedTuple):
@@ -158,7 +155,7 @@ class PhotoStore:
         last: the stage's last iteration.
         mesh: devices that draw the views of an iteration; None: one. Photographs that stay there are on each of them.
         has_depths: whether depth maps are loaded with the photographs.
-        room: largest number of bytes on the device; None: `DEVICE_SHARE` of its memory.
+        room: largest number of bytes on the device; None: `device_room()`.
         """
         self._views = views
         self._order = order
@@ -251,7 +248,7 @@ class Ahead:
 def device_room() -> float:
     """Return the bytes of the default device that photographs may take."""
     stats = default_device().memory_stats()
-    return DEVICE_SHARE * stats["bytes_limit"] if stats and "bytes_limit" in stats else HOST_SHARE
+    return DEVICE_SHARE * stats["bytes_limit"] if stats and "bytes_limit" in stats else CPU_ROOM
 
 
 def stack_views(views: list[View], among: tuple[View, ...] | None = None, *, has_depths: bool = False) -> Photographs:

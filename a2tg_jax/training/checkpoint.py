@@ -11,7 +11,7 @@ import numpy as np
 
 from a2tg_jax.appearance.base import check_appearance
 from a2tg_jax.appearance.files import arrays_of, with_arrays
-from a2tg_jax.base.archive import read_archive, write_archive
+from a2tg_jax.base.archive import arrays_below, read_archive, write_archive
 from a2tg_jax.base.machine import ALONE, Devices, Machine, this_machine
 from a2tg_jax.base.regular_files import reading
 from a2tg_jax.base.text import counted, shortened
@@ -222,9 +222,9 @@ def load_checkpoint(path: str | os.PathLike[str], system: type[System] | None = 
         return _checkpoint_of(header, arrays, system_from_dict(header["system"], str(path), system))
 
 
-def _checkpoint_of(header: dict[str, Any], arrays: dict[str, np.ndarray], options: System) -> Checkpoint:
-    options.check()
-    stages = options.all_stages()
+def _checkpoint_of(header: dict[str, Any], arrays: dict[str, np.ndarray], system: System) -> Checkpoint:
+    system.check()
+    stages = system.all_stages()
     index = header["stage"]
     is_ahead = header["is_ahead"]
     if type(index) is not int or not 0 <= index < len(stages):  # bool is an int
@@ -235,7 +235,7 @@ def _checkpoint_of(header: dict[str, Any], arrays: dict[str, np.ndarray], option
     # Any leaves: only the paths of the fields count.
     (gaussians,) = _filled((Gaussians(*range(5)),), arrays)
     check_gaussians(gaussians)
-    appearance = with_arrays(stage.appearance, _with_prefix(SHOWN, arrays), gaussians.sh_degree)
+    appearance = with_arrays(stage.appearance, arrays_below(SHOWN, arrays), gaussians.sh_degree)
     gaussians = jax.tree.map(jnp.asarray, gaussians)
     check_appearance(appearance, gaussians)
     model = Model(gaussians, appearance, jnp.zeros((), jnp.int32))
@@ -260,8 +260,8 @@ def _checkpoint_of(header: dict[str, Any], arrays: dict[str, np.ndarray], option
     devices = config_from_dict(Devices, header["devices"], "devices")
     views = None
     if header.get("views") is not None:  # Checkpoints of earlier versions do not record them.
-        views = RecordedViews.of_arrays(header["views"], _with_prefix(VIEWS, arrays))
-    return Checkpoint(options, index, state, history, machine=machine, devices=devices, views=views, **counts)
+        views = RecordedViews.of_arrays(header["views"], arrays_below(VIEWS, arrays))
+    return Checkpoint(system, index, state, history, machine=machine, devices=devices, views=views, **counts)
 
 
 LONGEST_DIFFERENCE = 300
@@ -291,10 +291,6 @@ def _packed(model: Model, moments: AdamState) -> AdamState:
         return dataclasses.replace(moment, appearance=partition(whole)[0])
 
     return dataclasses.replace(moments, mu=packed(moments.mu), nu=packed(moments.nu))
-
-
-def _with_prefix(prefix: str, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
 
 
 def _filled(template: object, arrays: dict[str, np.ndarray]) -> Any:

@@ -23,7 +23,7 @@ from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.training.returned import check_kept, check_scalar
 
 MOST_READABLE = 100
-"""Largest number of numbers of a row that `learned` lists."""
+"""`learned` leaves out rows of more numbers than this."""
 
 
 class Correction(NamedFields):

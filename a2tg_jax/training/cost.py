@@ -56,8 +56,9 @@ def forecast_stages(
     out; that one starts from `num_start` Gaussians, or, if it is None, from Gaussians at the scene's points.
     """
     stages = system.all_stages()
-    num = initial_number(scene, system, stages[0]) if num_start is None else num_start
+    num = initial_number(scene, system) if num_start is None else num_start
     stages = stages[first:]
+    own_floats = floats_per_gaussian(system.initial_sh_degree)
     floats = 0.0
     shared = 0
     appearance = None
@@ -71,10 +72,10 @@ def forecast_stages(
             floats = stage.floats_shown(system.initial_sh_degree)
             appearance = stage.appearance
             shared = stage.shared_bytes
-        model_bytes = BYTES_PER_FLOAT * (floats_per_gaussian(system.initial_sh_degree) + floats) * num + shared
+        model_bytes = BYTES_PER_FLOAT * (own_floats + floats) * num + shared
         for event in stage.events:
             model_bytes = event.most_bytes(model_bytes, num, stage.iterations)
-        floats = (model_bytes - shared) / BYTES_PER_FLOAT / num - floats_per_gaussian(system.initial_sh_degree)
+        floats = (model_bytes - shared) / BYTES_PER_FLOAT / num - own_floats
         on_host = [event for event in stage.events if isinstance(event, HostEvent)]
         num_programs = 1 + sum(event.num_programs(stage.iterations) for event in on_host)
         # An event has the old state and the new one; later, the devices get their shares.
@@ -88,8 +89,8 @@ def forecast_stages(
 def check_rows_fit(
     scene: Scene, system: System, first: int, num_start: int | None, devices: Devices, max_memory: int | None = None
 ) -> list[float]:
-    """Return the bytes of the model at its largest, of each stage from `first` on, before rows are allocated, after a
-    check that it can be held in memory.
+    """Check, before rows are allocated, that memory can hold the model of each stage from `first` on, and return the
+    bytes of these models at their largest.
 
     Only parameters, moments and gradients count, so that nothing is refused that would fit. Several processes are not
     checked, because each knows the memory of its own machine alone.
@@ -128,7 +129,8 @@ def check_step_fits(
     devices: Devices,
     max_memory: int | None = None,
 ) -> float:
-    """Return the bytes of memory in use while a compiled step runs, before it runs for the first time (host).
+    """Check that a compiled step fits into memory, before it first runs, and return the bytes in use while it runs
+    (host).
 
     Args:
       step: the step, of which XLA says how much it allocates.

@@ -42,7 +42,7 @@ class StageResult(NamedFields):
     """Number of times the tile lists needed more room; each cost a compilation."""
 
     def __repr__(self) -> str:
-        return f"StageResult({self.name!r}, {_result(self.model, self.seconds)})"
+        return f"StageResult({self.name!r}, {_in_words(self.model, self.seconds)})"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -108,10 +108,10 @@ class FitResult(NamedFields):
 
     def __repr__(self) -> str:
         stages = counted(len(self.stages), "stage")
-        return f"FitResult({type(self.system).__name__}, {stages}, {_result(self.model, self.seconds)})"
+        return f"FitResult({type(self.system).__name__}, {stages}, {_in_words(self.model, self.seconds)})"
 
 
-def _result(model: Model, seconds: float) -> str:
+def _in_words(model: Model, seconds: float) -> str:
     return f"{counted(model.num, 'Gaussian')}, {in_bytes(model.num_bytes)}, {seconds:.0f} s"
 
 
@@ -181,13 +181,14 @@ def fit(
             first += 1
     session = session or Session()
     start = checked_start(scene, system, first, start, resume, len(stages))
-    sizes: list[float] = []
+    model_bytes: list[float] = []
     if resume is None:
-        sizes = check_rows_fit(scene, system, first, None if start is None else start.num, session.devices, max_memory)
+        num = None if start is None else start.num
+        model_bytes = check_rows_fit(scene, system, first, num, session.devices, max_memory)
     results: list[StageResult] = []
     for index in range(first, len(stages)):
         run = StageRun(scene, system, index, start, resume, session=session, max_memory=max_memory)
-        after = RestOfRun(model_bytes=max(sizes[index + 1 :], default=0))
+        after = RestOfRun(model_bytes=max(model_bytes[index + 1 :], default=0))
         run.train(on_checkpoint, checkpoint_every, on_log, Progress(progress, after=after), is_stopped)
         is_last = index == len(stages) - 1
         results.append(_result_of(run, scene, is_last=is_last))
@@ -204,8 +205,8 @@ def _check_arguments(
 ) -> None:  # fmt: skip
     """Raise ValueError unless the arguments are of their classes, and the training views and the options are valid."""
     check_untraced("fit")
-    is_path = str, os.PathLike
-    check_kind("scene", scene, Scene, f"use load_scene({os.fspath(scene)!r})" if isinstance(scene, is_path) else "")
+    paths = (str, os.PathLike)
+    check_kind("scene", scene, Scene, f"use load_scene({os.fspath(scene)!r})" if isinstance(scene, paths) else "")
     if not isinstance(system, System):
         kind = kind_of(system)
         example = ""
@@ -216,11 +217,10 @@ def _check_arguments(
             example = f": use {system.__name__}() or {system.__name__}.preset('quick')"
         raise ValueError(f"system must be a System; got {kind}{example}")
     if resume is not None:
-        check_kind("resume", resume, Checkpoint, "use load_checkpoint(path)" if isinstance(resume, is_path) else "")
+        check_kind("resume", resume, Checkpoint, "use load_checkpoint(path)" if isinstance(resume, paths) else "")
     if start is not None:
-        hints = {
-            str: "use load_model(path)",
-            os.PathLike: "use load_model(path)",
+        hints: dict[Any, str] = {
+            paths: "use load_model(path)",
             Gaussians: "use Model(gaussians), in the world of the scene",
             FitResult: "use result.model, or call result.more(scene, iterations) to train on",
             StageResult: "use result.model",

@@ -167,7 +167,7 @@ class StageRun:
         self.num_restored = num_restored
         self._earlier = resumed.history if resumed else History.empty()
         self._rows: list[dict[str, float]] = []
-        """Rows of the history since then."""
+        """Rows that were logged after `_earlier`."""
 
         if resume is None:
             state = state_of_start(scene, system, index, start, self.session.num_devices)
@@ -180,7 +180,7 @@ class StageRun:
         self.key = jax.random.fold_in(jax.random.key(system.seed), index + 1)
         self.order = BatchOrder(self.views, system.batch_size, system.seed * 2 + index + 1, self.num_restored)
         self.photographs = PhotoStore(self.views, self.order, self.stage.iterations, self.mesh, self.stage.has_depths)
-        self.launched = LAUNCHED if self.photographs.is_resident else self.photographs.num_ahead
+        self.num_launched = LAUNCHED if self.photographs.is_resident else self.photographs.num_ahead
         self.learning = LearningCheck(
             self.views, self.order, self.stage.iterations, system.background, is_first=index == 0,
             small_budget=system.small_budget,
@@ -248,7 +248,7 @@ class StageRun:
         with contextlib.closing(self.photographs), display:
             while iteration < end:
                 # Python acts after `launched` steps, and at events and checkpoints.
-                stops = [iteration + self.launched - iteration % self.launched, end]
+                stops = [iteration + self.num_launched - iteration % self.num_launched, end]
                 stops += [due for due in self._due_on_host() if due > iteration]
                 if checkpoint_every is not None:
                     stops.append(iteration + checkpoint_every - iteration % checkpoint_every)
@@ -260,10 +260,9 @@ class StageRun:
                     self.learning.observe(iteration, float(info.psnr))
                     row = self._rows[-1] if self._rows else None
                     display.update(float(info.loss), float(info.psnr), row, pace.left(iteration))
-                effects = self.effects
-                ahead = effects.programs_ahead(iteration)
-                pace.time(iteration, effects.num_compiled, ahead, effects.seconds_a_program)
-                forecast = pace.told(iteration)
+                ahead = self.effects.programs_ahead(iteration)
+                pace.time(iteration, self.effects.num_compiled, ahead, self.effects.seconds_a_program)
+                forecast = pace.due_forecast(iteration)
                 if forecast is not None:
                     display.tell(f"{forecast}; {in_bytes(self.memory or 0)} of memory")
                 self.time_left = pace.left(iteration)

@@ -34,7 +34,7 @@ class RestOfRun(NamedTuple):
     """Work that is left in a run after a stage."""
 
     iterations: float = 0.0
-    """Its time as a number of the stage's iterations, without compilation."""
+    """Time of its steps, as a number of iterations of that stage."""
     programs: int = 0
     """Number of programs to compile."""
     model_bytes: float = 0.0
@@ -112,12 +112,14 @@ class Pace:
         now = self._now()
         self._ahead = ahead
         self._seconds_a_program = seconds_a_program
-        if self._before is not None and self._before[2] == num_compiled:
-            self._steps += done - self._before[0]
-            self._seconds += now - self._before[1]
+        if self._before is not None:
+            done_before, before, num_compiled_before = self._before
+            if num_compiled == num_compiled_before:
+                self._steps += done - done_before
+                self._seconds += now - before
         self._before = done, now, num_compiled
 
-    def told(self, done: int) -> str | None:
+    def due_forecast(self, done: int) -> str | None:
         """Return a forecast if one is due and enough was timed since the last, or None."""
         left = self.left(done)
         is_due = self._due and done >= self._due[0] and self._steps >= TIMED_STEPS and self._seconds >= TIMED_SECONDS
@@ -180,8 +182,8 @@ class LearningCheck:
         reached = float(np.mean([psnr for _, psnr in self._seen]))
         flat = []
         # Flat colours of the same views, because some are easier than others.
-        for iteration, _ in self._seen:
-            for index in self._order.indices(iteration):
+        for earlier, _ in self._seen:
+            for index in self._order.indices(earlier):
                 view = self._views[index]
                 mask = None if view.mask is None else view.mask.read()
                 flat.append(float(jax.jit(flat_psnr)(view_image(view, (self._level,) * 3), mask)))

@@ -98,7 +98,7 @@ class Stage(NamedFields):
     name: str = beside()
     """A short word, unique in its system. Steps do not depend on it, so that stages that differ in nothing else share
     one program."""
-    appearance: Appearance = dataclasses.field(metadata={"static": True})
+    appearance: Appearance = static()
     """Template of what the splats show: an appearance without arrays, such as `Appearance(texture=Texture())`."""
     events: tuple[Event, ...]
     """Events such as densification, noise and texture growth, in order of application."""
@@ -107,13 +107,13 @@ class Stage(NamedFields):
     rates: LearningRates
     """Learning rates of the Gaussians."""
     iterations: int
-    """Views seen, times the batch size."""
+    """Number of steps; each sees `batch_size` views."""
     appearance_rate: Any = None
     """Learning rate of the appearance's arrays: a number for all, or a mapping by field (`Appearance.rates`); 0: they
     stay unchanged. None: the appearance has no arrays."""
     corrections: tuple[Correction, ...] = ()
     """Corrections of each training view, such as exposures and poses."""
-    raises_sh_degree: bool = dataclasses.field(default=False, metadata={"static": True})
+    raises_sh_degree: bool = static(default=False)
     """Whether the stage begins with degree 0 and adds one after every thirtieth of its length."""
     cools_down: bool = static(default=False)
     """Whether all learning rates also fall linearly over the stage, to a tenth at its end."""
@@ -257,7 +257,7 @@ class Stage(NamedFields):
         return tuple(event for event, times in zip(self.events, self.times, strict=True) if times == all_times)
 
     def clock(self, iteration: int, largest_loss: float = math.inf) -> "Clock":
-        """Return the schedule for the step of an iteration, which is not taken beyond a loss (host)."""
+        """Return the schedule of an iteration, whose step is not taken if its loss exceeds `largest_loss` (host)."""
         num_left: list[int | None] = []
         for event, times in zip(self.events, self.times, strict=True):
             left = len(times) - times.index(iteration) if iteration in times else 0

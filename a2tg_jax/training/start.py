@@ -114,7 +114,7 @@ def with_room(stage: Stage, state: TrainState) -> TrainState:
 def initial_model(scene: Scene, system: System) -> Model:
     """Return Gaussians at the scene's points, as many as the first stage has room for."""
     first = system.stages()[0]
-    num = initial_number(scene, system, first)
+    num = initial_number(scene, system)
     degree = system.initial_sh_degree
     opacity = system.initial_opacity
     gaussians = init_from_points(scene.points, start_colors(scene), num, system.seed, opacity=opacity, sh_degree=degree)
@@ -184,7 +184,7 @@ def check_start(scene: Scene, system: System) -> None:
     stage cannot work with the initial number of Gaussians."""
     first = system.stages()[0]
     _check_seen("scene.points", np.asarray(scene.points), scene)
-    num = initial_number(scene, system, first)
+    num = initial_number(scene, system)
     rows_needed(first, num, system)
     system.check_number(num)
 
@@ -331,11 +331,11 @@ def rows_needed(stage: Stage, num: int, system: System) -> int:
     return rows
 
 
-def initial_number(scene: Scene, system: System, first: Stage) -> int:
+def initial_number(scene: Scene, system: System) -> int:
     """Return the number of initial Gaussians: as requested, at most one for each point, and at most what the first
     stage has room for."""
     num = len(scene.points)
-    caps = [event.most_gaussians for event in first.events]
+    caps = [event.most_gaussians for event in system.stages()[0].events]
     return min([num, system.initial_gaussians or num, *(cap for cap in caps if cap is not None)])
 
 

@@ -285,10 +285,6 @@ def batch_gradients(
     height, width = batch.images.shape[1:3]
     highest = settings.render.sh_degree
     degree = jnp.minimum((iteration - 1) // clock.sh_interval, highest) if stage.raises_sh_degree else highest
-    options: dict[str, Any] = {
-        "has_geometry": stage.has_geometry, "sh_degree": degree,
-        "statistic": stage.statistic, "has_probe": is_gathering,
-    }  # fmt: skip
 
     def loss(
         model: Model, view: TracedView, output: RenderOutput
@@ -325,7 +321,10 @@ def batch_gradients(
     def gradients_of(model: Model, arrays: tuple[Any, ...]) -> BatchGradients:
         viewmat, K, background, rows, pictures = arrays
         view = TracedView(Camera(viewmat, K, width, height, batch.rays), background, stage.corrections, rows, pictures)
-        result = differentiate(loss, model, view, settings.render, **options)
+        result = differentiate(
+            loss, model, view, settings.render,
+            has_geometry=stage.has_geometry, sh_degree=degree, statistic=stage.statistic, has_probe=is_gathering,
+        )  # fmt: skip
         error, overflow, terms = result.auxiliary
         grads = result.gaussians, result.appearance, result.rows
         psnr = -10 * jnp.log10(error)

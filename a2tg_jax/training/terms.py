@@ -106,12 +106,12 @@ def l1(model: Model, target: Target, output: RenderOutput) -> Array:
 
 
 def normals(model: Model, target: Target, output: RenderOutput) -> Array:
-    """Normal consistency of 2DGS."""
+    """Return the normal consistency of 2DGS."""
     return normal_consistency(output.normal, output.depth, output.alpha, target.camera)
 
 
 def distortion(model: Model, target: Target, output: RenderOutput) -> Array:
-    """Depth distortion of 2DGS."""
+    """Return the depth distortion of 2DGS."""
     return jnp.mean(output.distortion)
 
 
