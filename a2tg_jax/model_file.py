@@ -32,10 +32,10 @@ from a2tg_jax.model import Model, check_model, checked_live
 
 FORMAT = "a2tg-jax model"
 FIELDS = tuple(field.name for field in dataclasses.fields(Gaussians))
+# Prefixes of the names of arrays.
 APPEARANCE = "appearance/"
 ORIGIN = "origin/"
 CORRECTIONS = "corrections/"
-"""Prefixes of the names of arrays."""
 ORIGIN_KINDS: dict[str, tuple[str, str, Any]] = {
     "sizes": ("iu", "integers", np.int64),
     "is_test": ("b", "bool", np.bool_),

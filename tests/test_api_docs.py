@@ -100,9 +100,8 @@ def test_every_argument_and_result_is_described(name):
 
 
 INTERNAL = {
-    "Clock", "CloneSplitPlan", "Coefficients", "Devices", "Event", "KernelRates", "Machine",
+    "BandStatistics", "Clock", "CloneSplitPlan", "Coefficients", "Devices", "Event", "KernelRates", "Machine",
     "Progress", "RecordedViews", "Shape", "SplitStatistics", "TrainState",
-    "ViewDependence",
 }  # fmt: skip
 """Types in public signatures whose values users only pass on, or give as mappings."""
 

@@ -39,7 +39,7 @@ from a2tg_jax import (
 from a2tg_jax.appearance.parts import empty_bands, floats_of_band, sizes_of_degrees
 from a2tg_jax.core.budget import within_budget
 from a2tg_jax.core.table import Shape, bucket_capacity, resize
-from a2tg_jax.densify.view_dependence import ViewDependence, most_blocks, raised_degrees, without_idle
+from a2tg_jax.densify.view_dependence import BandStatistics, most_blocks, raised_degrees, without_idle
 from a2tg_jax.training.start import padded
 
 NUM = 40
@@ -175,7 +175,7 @@ def test_the_gradient_of_missing_coefficients_is_that_of_coefficients_that_are_z
     centers = rng.normal(size=(6, 3)) + 5
     colors = rng.normal(size=(6, NUM, 3)).astype(np.float32)
     as_array = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
-    state = ViewDependence.init(NUM).observe(as_array(means), as_array(centers), as_array(colors))
+    state = BandStatistics.init(NUM).observe(as_array(means), as_array(centers), as_array(colors))
     expected = np.zeros((NUM, 16, 3))
     for center, color in zip(centers, colors, strict=True):
         for i in range(NUM):

@@ -133,7 +133,8 @@ def gaussians_at_errors(
         return no_rows(0, model.gaussians.sh.shape[1], dtype)
     view_of = rng.choice(len(totals), num, p=np.asarray(totals) / sum(totals))
     # Each Gaussian takes a pixel of a view that is drawn by its share of the error; every view has drawn `num` pixels.
-    points, normals, colors, sizes = (np.stack(column)[view_of, np.arange(num)] for column in zip(*drawn, strict=True))
+    chosen = [np.stack(column)[view_of, np.arange(num)] for column in zip(*drawn, strict=True)]
+    points, normals, colors, sizes = chosen
     arrays = (
         points,
         Rotation.from_matrix(_axes(normals, rng)).as_quat(scalar_first=True),

@@ -26,7 +26,7 @@ from a2tg_jax.model import Model
 
 
 @pytree
-class ViewDependence:
+class BandStatistics:
     """Sums over views of the gradient at all 16 coefficients of each Gaussian, whether it has them or not."""
 
     total: Array
@@ -35,18 +35,18 @@ class ViewDependence:
     """[] int32, views so far."""
 
     @staticmethod
-    def init(num: int, dtype: DTypeLike = jnp.float32) -> "ViewDependence":
+    def init(num: int, dtype: DTypeLike = jnp.float32) -> "BandStatistics":
         """Return empty sums for `num` Gaussians."""
-        return ViewDependence(jnp.zeros((num, 16, 3), dtype), jnp.zeros((), jnp.int32))
+        return BandStatistics(jnp.zeros((num, NUM_BASES[-1], 3), dtype), jnp.zeros((), jnp.int32))
 
-    def observe(self, means: Array, centers: Array, colors: Array) -> "ViewDependence":
+    def observe(self, means: Array, centers: Array, colors: Array) -> "BandStatistics":
         """Add V views: cameras at centers [V, 3], and gradients [V, N, 3] by the colour of each Gaussian."""
         total = self.total
         # One view at a time: all at once would take [V, N, 16, 3].
         for center, color in zip(centers, colors, strict=True):
             basis = sh_basis(directions_from(center, means))
             total = total + basis[:, :, None] * color[:, None, :]
-        return ViewDependence(total, self.views + len(colors))
+        return BandStatistics(total, self.views + len(colors))
 
     def strengths(self) -> np.ndarray:
         """Return [N, 3] norm of the average gradient at the coefficients of degree 1, 2 and 3 (host)."""
@@ -107,14 +107,14 @@ class AdaptDegrees(HostEvent):
         table, moments = resize(table, table.sizes, moments, room=room)
         return dataclasses.replace(model, appearance=model.appearance.with_coefficients(table)), moments
 
-    def init(self, model: Model) -> ViewDependence:
-        return ViewDependence.init(model.gaussians.num, model.gaussians.means.dtype)
+    def init(self, model: Model) -> BandStatistics:
+        return BandStatistics.init(model.gaussians.num, model.gaussians.means.dtype)
 
-    def observe(self, state: ViewDependence, model: Model, seen: Seen) -> ViewDependence:
+    def observe(self, state: BandStatistics, model: Model, seen: Seen) -> BandStatistics:
         centers = jax.vmap(lambda camera: camera.center)(seen.cameras)
         return state.observe(model.gaussians.means, centers, seen.colors)
 
-    def apply(self, due: Due, model: Model, moments: AdamState, state: ViewDependence) -> Change:
+    def apply(self, due: Due, model: Model, moments: AdamState, state: BandStatistics) -> Change:
         table = model.appearance.coefficients
         base = model.gaussians.sh_degree
         num = model.num

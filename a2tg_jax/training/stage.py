@@ -257,7 +257,7 @@ class Stage(NamedFields):
         return tuple(event for event, times in zip(self.events, self.times, strict=True) if times == all_times)
 
     def clock(self, iteration: int, largest_loss: float = math.inf) -> "Clock":
-        """Return the schedule of an iteration, whose step is not taken if its loss exceeds `largest_loss` (host)."""
+        """Return the schedule of an iteration, whose step is not taken if its loss exceeds the largest (host)."""
         num_left: list[int | None] = []
         for event, times in zip(self.events, self.times, strict=True):
             left = len(times) - times.index(iteration) if iteration in times else 0
