@@ -247,13 +247,13 @@ class StageRun:
         display = (progress.display or Display)(progress.title or self.stage.name, iteration, end)
         with contextlib.closing(self.photographs), display:
             while iteration < end:
-                # Python acts after `launched` steps, and at events and checkpoints.
-                stops = [iteration + self.num_launched - iteration % self.num_launched, end]
-                stops += [due for due in self._due_on_host() if due > iteration]
+                # Python acts after `num_launched` steps, and at events and checkpoints.
+                pauses = [iteration + self.num_launched - iteration % self.num_launched, end]
+                pauses += [due for due in self._due_on_host() if due > iteration]
                 if checkpoint_every is not None:
-                    stops.append(iteration + checkpoint_every - iteration % checkpoint_every)
-                stop = min(stops)
-                for info in self.steps(iteration + 1, stop, stops_launching):
+                    pauses.append(iteration + checkpoint_every - iteration % checkpoint_every)
+                pause = min(pauses)
+                for info in self.steps(iteration + 1, pause, stops_launching):
                     iteration += 1
                     if iteration % LOG_EVERY == 0 or iteration == end:
                         self._log(iteration, info, on_log)
@@ -267,25 +267,30 @@ class StageRun:
                     display.tell(f"{forecast}; {in_bytes(self.memory or 0)} of memory")
                 self.time_left = pace.left(iteration)
                 # `iteration` is less if a step could not be taken or training is being stopped.
-                if iteration == stop:
+                if iteration == pause:
                     self._host_events(iteration)
                 self.started += self.session.watch(self, is_stopped)
                 must_stop = any_process(self.mesh, is_stopped())
-                is_due = checkpoint_every is not None and iteration % checkpoint_every == 0 and iteration == stop
+                is_due = checkpoint_every is not None and iteration % checkpoint_every == 0 and iteration == pause
                 if on_checkpoint is not None and (is_due or must_stop or iteration == end):
                     on_checkpoint(self.checkpoint)
                 if must_stop:
                     raise Interrupted(self.checkpoint)
         self.effects.warn_of_unused()
-        if self.num_refused:
-            events = [event for event in self.stage.events if event.limited_by]
-            caps = [f"{self.system.path_of(event)}.{event.limited_by}" for event in events]
-            advice = f": raise {' or '.join(caps)}" if caps else ""
-            warnings.warn(
-                f"stage {self.stage.name}: {self.num_refused:,} times there was no room for a Gaussian that should "
-                f"have been added, all {self.state.model.gaussians.num:,} rows being in use{advice}",
-                stacklevel=2,
-            )
+        self._warn_of_refused()
+
+    def _warn_of_refused(self) -> None:
+        """Warn if Gaussians that events should have added found no room."""
+        if self.num_refused == 0:
+            return
+        events = [event for event in self.stage.events if event.limited_by]
+        caps = [f"{self.system.path_of(event)}.{event.limited_by}" for event in events]
+        advice = f": raise {' or '.join(caps)}" if caps else ""
+        warnings.warn(
+            f"stage {self.stage.name}: {self.num_refused:,} times there was no room for a Gaussian that should "
+            f"have been added, all {self.state.model.gaussians.num:,} rows being in use{advice}",
+            stacklevel=3,
+        )
 
     def _log(self, iteration: int, info: StepInfo, on_log: OnLog | None) -> None:
         """Add a row to the history."""

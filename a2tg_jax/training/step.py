@@ -226,34 +226,40 @@ def attempt(
     model = combine(step.params, partition(model)[1])
     model = dataclasses.replace(model, appearance=project_appearance(model.appearance))
 
-    height, width = batch.images.shape[1:3]
-    cameras = Camera(batch.viewmats, batch.Ks, width, height)
-    if correction_rows:
-        cameras = jax.vmap(functools.partial(corrected_camera, stage.corrections))(correction_rows, cameras)
-    # ∂L/∂colour: the colour is linear in the first coefficient, with the factor SH_C0.
-    colors = of_gaussians.sh[:, :, 0] / SH_C0
-    seen = Seen(cameras, jnp.zeros_like(colors), jnp.zeros(colors.shape[:2], bool), colors)
-    if drawn.statistic is not None and stage.statistic is not None:
-        gradients, is_visible = read_probe(drawn.statistic, stage.statistic, width, height)
-        seen = seen._replace(gradients=gradients, is_visible=is_visible)
-    at = clock.scheduled(iteration)
-    length = jnp.asarray(clock.num_iterations)
-    now = Now(keys[1:], at, stage.cooled(rate, progress), length, scene_scale)
+    seen = _seen(stage, batch, correction_rows, drawn)
+    num_iterations = jnp.asarray(clock.num_iterations)
+    now = Now(keys[1:], clock.scheduled(iteration), stage.cooled(rate, progress), num_iterations, scene_scale)
     change, events = _events(settings.due, stage, clock, now, seen, model, moments, state.events)
     corrections = tuple(
         updated(correction, correction_state, rows, grad, progress)  # type: ignore[arg-type]
         for correction, correction_state, grad in zip(stage.corrections, state.corrections, of_corrections, strict=True)
     )
     after = TrainState(change.model, change.moments, events, iteration, state.status, corrections)
-    made: Any = partition(change.model)[0]
+    changed: Any = partition(change.model)[0]
     if settings.due is not None:
         # Adam's results are finite if the gradients are. Only leaves that a projection or an event has changed, which
         # are other tracers, are checked, because the check makes a GPU write a leaf twice.
         ids_after_adam = {id(leaf) for leaf in jax.tree.leaves(step.params)}
-        made = [leaf for leaf in jax.tree.leaves(made) if id(leaf) not in ids_after_adam]
+        changed = [leaf for leaf in jax.tree.leaves(changed) if id(leaf) not in ids_after_adam]
     rows_after = [correction.rows for correction in corrections]
-    is_finite = _are_finite(jax.tree.leaves((drawn.loss, grads, of_corrections, made, rows_after)))
+    is_finite = _are_finite(jax.tree.leaves((drawn.loss, grads, of_corrections, changed, rows_after)))
     return Attempt(drawn, (*grads, of_corrections), after, change.info, is_finite)
+
+
+def _seen(stage: Stage, batch: Photographs, correction_rows: tuple[Array, ...], drawn: BatchGradients) -> Seen:
+    """Return what events observe of a step: its cameras, and the gradients of the splats in each view."""
+    height, width = batch.images.shape[1:3]
+    cameras = Camera(batch.viewmats, batch.Ks, width, height)
+    if correction_rows:
+        cameras = jax.vmap(functools.partial(corrected_camera, stage.corrections))(correction_rows, cameras)
+    of_gaussians, *_ = drawn.grads
+    # ∂L/∂colour: the colour is linear in the first coefficient, with the factor SH_C0.
+    colors = of_gaussians.sh[:, :, 0] / SH_C0
+    seen = Seen(cameras, jnp.zeros_like(colors), jnp.zeros(colors.shape[:2], bool), colors)
+    if drawn.statistic is None or stage.statistic is None:
+        return seen
+    gradients, is_visible = read_probe(drawn.statistic, stage.statistic, width, height)
+    return seen._replace(gradients=gradients, is_visible=is_visible)
 
 
 def _are_finite(leaves: Sequence[Array]) -> Array:
@@ -351,6 +357,18 @@ def optimized(stage: Stage, state: TrainState, grads: Any, rate_of_means: Array,
     return adam_update(floats, grads, state.moments, rates)
 
 
+def _applied(event: StepEvent, now: Now, carry: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Return model, moments and state after an event, which must keep their shapes, and its information."""
+    model, moments, state = carry
+    with calling(event, "apply"):
+        change = checked_change(event.apply(now, model, moments, state))
+        check_kept("model", change.model, model)
+        check_kept("state", change.state, state)
+    is_possible, num_refused = change.info
+    info = EventInfo(jnp.asarray(is_possible), jnp.asarray(num_refused, jnp.int32))
+    return change.model, change.moments, change.state, info
+
+
 def _events(
     due: tuple[bool, ...] | None, stage: Stage, clock: Clock, now: Now, seen: Seen, model: Model,
     moments: AdamState, states: Sequence[Any],
@@ -369,29 +387,16 @@ def _events(
             keys = now.keys[first_key : first_key + event.num_keys]
             of_event = now._replace(keys=keys, num_left=None if num_left is None else jnp.asarray(num_left, jnp.int32))
             first_key += event.num_keys
-
-            def apply(carry: tuple[Any, ...], event: StepEvent = event, now: Now = of_event) -> tuple[Any, ...]:
-                model, moments, state = carry
-                with calling(event, "apply"):
-                    change = checked_change(event.apply(now, model, moments, state))
-                    check_kept("model", change.model, model)
-                    check_kept("state", change.state, state)
-                is_possible, num_refused = change.info
-                info = EventInfo(jnp.asarray(is_possible), jnp.asarray(num_refused, jnp.int32))
-                return change.model, change.moments, change.state, info
-
-            def wait(carry: tuple[Any, ...]) -> tuple[Any, ...]:
-                return *carry, nothing
-
             carry = (model, moments, state)
+            apply = functools.partial(_applied, event, of_event)
             if num_left is None:  # It happens after every iteration.
                 model, moments, state, info = apply(carry)
             elif state is None:  # It is past.
                 info = nothing
             elif due is None:  # The step itself decides.
-                model, moments, state, info = jax.lax.cond(num_left > 0, apply, wait, carry)
+                model, moments, state, info = jax.lax.cond(num_left > 0, apply, lambda carry: (*carry, nothing), carry)
             else:
-                model, moments, state, info = apply(carry) if due[place] else wait(carry)
+                model, moments, state, info = apply(carry) if due[place] else (*carry, nothing)
             infos = EventInfo(infos.is_possible & info.is_possible, infos.num_refused + info.num_refused)
         new_states.append(state)
     return Change(model, moments, None, infos), tuple(new_states)
