@@ -100,7 +100,7 @@ def test_compress_with_tuning(run, tmp_path, monkeypatch, capsys):
     printed = capsys.readouterr().out
     scene = read_record(run).scene.load()
     # Nothing grows.
-    assert re.search(r"\ntuning 1 of up to 4: .*, about 0:\d\d:\d\d left; \d+ MB of memory\n", printed)
+    assert re.search(r"\ntuning 1 of up to 4: .*, about 0:\d\d:\d\d left; [\d.]+ [MG]B of memory\n", printed)
     assert "then training up to" in printed and "\ntuned 1 " in printed and "\ntuned 1: means " in printed
     before, after = (
         evaluate(scene.train, m).psnr for m in (load_model(run.model("a2tg-textures")), load_compact(tuned))
