@@ -1,4 +1,4 @@
-"""What views hold of their photographs: pixels, masks and depth maps, in memory or read on demand."""
+"""Photographs of views, their masks and depth maps, in memory or read on demand."""
 
 import dataclasses
 import os

@@ -1,4 +1,4 @@
-"""What a run needs at least of memory and disk, before anything is compiled, and errors for runs that cannot fit."""
+"""The least memory and disk that a run needs, before anything is compiled, and errors for runs that cannot fit."""
 
 import dataclasses
 import math
@@ -50,7 +50,7 @@ class Bytes(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class RunForecast:
-    """What a run needs at least. Renders and compiled programs come on top: XLA says how much before a stage begins."""
+    """The least that runs need. Renders and compiled programs come on top; XLA says how much before a stage begins."""
 
     phases: Mapping[str, Bytes]
     """Memory of each stage, by name."""

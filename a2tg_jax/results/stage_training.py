@@ -5,7 +5,7 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
-from a2tg_jax import Checkpoint, Model, Scene, StageResult, System, load_checkpoint, load_model, save_checkpoint
+from a2tg_jax import Checkpoint, Model, Origin, Scene, StageResult, System, load_checkpoint, load_model, save_checkpoint
 from a2tg_jax.base.archive import read_archive_header
 from a2tg_jax.base.machine import this_machine
 from a2tg_jax.base.text import counted
@@ -87,12 +87,14 @@ def _model_to_start(path: Path, scene: Scene) -> Model:
     """Return the model of the stage before, after a check that the scene still has its training views."""
     model = load_model(path)
     check_held_out(model, scene, path)
-    origin = model.origin
-    if origin is not None:
-        trained = [name for name, is_test in zip(origin.names, origin.is_test, strict=True) if not is_test]
+    if model.origin is not None:
         advice = "restore the photographs, or train in a new folder"
-        check_names(trained, [view.name for view in scene.train], str(path), advice)
+        check_names(_trained_names(model.origin), [view.name for view in scene.train], str(path), advice)
     return model
+
+
+def _trained_names(origin: Origin) -> list[str]:
+    return [name for name, is_test in zip(origin.names, origin.is_test, strict=True) if not is_test]
 
 
 def check_held_out(model: Model, scene: Scene, path: Path) -> None:
@@ -100,8 +102,8 @@ def check_held_out(model: Model, scene: Scene, path: Path) -> None:
     metrics. A model without an origin, whose views are unknown, passes."""
     if model.origin is None:
         return
-    trained = {name for name, is_test in zip(model.origin.names, model.origin.is_test, strict=True) if not is_test}
-    leaked = sorted(trained & {view.name for view in scene.test} - {view.name for view in scene.train})
+    held_out = {view.name for view in scene.test} - {view.name for view in scene.train}
+    leaked = sorted(held_out.intersection(_trained_names(model.origin)))
     if leaked:
         raise ValueError(
             f"{path} was trained on {counted(len(leaked), 'view')} that {scene.name} now holds out, such as "

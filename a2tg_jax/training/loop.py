@@ -92,7 +92,7 @@ def are_events_decided_by_host(state: TrainState) -> bool:
 
 
 class Session:
-    """What trainings of one program share: devices, shapes that steps are compiled for, and a view of the training.
+    """Shared by the trainings of a program: devices, shapes that steps are compiled for, and a view of the training.
 
     `fit` makes a new session unless you pass one. Pass the same session to all trainings of a sweep. No result depends
     on the shapes; on several devices sums have another order, so that last digits differ.

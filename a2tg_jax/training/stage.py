@@ -260,10 +260,11 @@ class Stage(NamedFields):
         """Return the schedule of an iteration, whose step is not taken if its loss exceeds the largest (host)."""
         num_left: list[int | None] = []
         for event, times in zip(self.events, self.times, strict=True):
-            left = len(times) - times.index(iteration) if iteration in times else 0
             # An event of every iteration needs no condition in the step.
-            is_conditional = isinstance(event, StepEvent) and times != every_iteration(self.iterations)
-            num_left.append(left if is_conditional else None)
+            if not isinstance(event, StepEvent) or times == every_iteration(self.iterations):
+                num_left.append(None)
+            else:
+                num_left.append(len(times) - times.index(iteration) if iteration in times else 0)
         return Clock(
             num_iterations=self.iterations,
             done=self.iterations if self.continues else 0,
