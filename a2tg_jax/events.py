@@ -107,6 +107,8 @@ class Due(NamedFields):
     """Training views, with the cameras that the scene gives."""
     background: Color = BLACK
     """Background of the views, RGB in [0, 1]; black where training takes random ones."""
+    seed: int = 0
+    """Random seed of the system, for draws of the event."""
     shapes: set[Shape] = dataclasses.field(default_factory=set)
     """Shapes of textures that steps are compiled for; an event adds the shapes that it makes."""
 

@@ -114,11 +114,11 @@ def test_transparent_pixels_have_the_colour_of_the_background():
     np.testing.assert_allclose(np.asarray(new.sh[:, 0]) * SH_C0 + 0.5, 1, atol=1e-5)
 
 
-def applied(event: PlaceByError, model: a2tg.Model, views: list[View]):
+def applied(event: PlaceByError, model: a2tg.Model, views: list[View], seed: int = 0):
     moments = adam_init(partition(model)[0])
     ones = jax.tree.map(jnp.ones_like, (moments.mu, moments.nu))
     moments = dataclasses.replace(moments, mu=ones[0], nu=ones[1])
-    return event.apply(Due(views=views), model, moments, ())
+    return event.apply(Due(views=views, seed=seed), model, moments, ())
 
 
 def test_the_event_adds_a_share_up_to_the_cap():
@@ -137,6 +137,8 @@ def test_the_event_adds_a_share_up_to_the_cap():
     assert hidden.model.num == 1 and "views are right" in hidden.unused
     again = applied(PlaceByError(share=1.0, cap=100), model, views)
     assert bits_of(again.model) == bits_of(change.model)
+    other = applied(PlaceByError(share=1.0, cap=100), model, views, seed=1)
+    assert bits_of(other.model) != bits_of(change.model)
 
 
 def test_appearance_of_new_rows_is_the_initial_one():

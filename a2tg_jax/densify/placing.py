@@ -82,12 +82,13 @@ class PlaceByError(HostEvent):
         if room <= 0:
             reason = "share adds no Gaussian, because there are as many as the cap allows; prune some before"
             return Change(model, moments, state, unused=reason)
-        rng = np.random.default_rng(due.index)
+        rng = np.random.default_rng((due.seed, due.index))
         added = gaussians_at_errors(model, due.views, due.background, min(num_added, room), rng)
         if not added.num:
             reason = "share adds no Gaussian, because views are right wherever a surface is drawn and masks count"
             return Change(model, moments, state, unused=reason)
-        appearance = allocate_appearance(template_of(model.appearance), jax.random.key(due.index), added)
+        key = jax.random.fold_in(jax.random.key(due.seed), due.index)
+        appearance = allocate_appearance(template_of(model.appearance), key, added)
         rows = np.arange(num, num + added.num)
 
         def replaced(old: Array, new: ArrayLike) -> Array:

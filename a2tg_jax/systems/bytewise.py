@@ -69,7 +69,7 @@ class Bytewise(TwoStages):
     """Options of the texture lookup."""
 
     name: ClassVar[str] = "bytewise"
-    version: ClassVar[int] = 5
+    version: ClassVar[int] = 6
 
     @property
     def initial_sh_degree(self) -> int:

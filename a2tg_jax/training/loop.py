@@ -443,7 +443,7 @@ class StageRun:
     def _apply(self, place: int, event: HostEvent, index: int, count: int) -> None:
         """Apply the event at a place, for the `index`-th of `count` times."""
         background = BACKGROUNDS[self.system.background]
-        due = Due(index, count, self.views, background=background, shapes=self.session.shapes)
+        due = Due(index, count, self.views, background, self.system.seed, self.session.shapes)
         with calling(event, "apply", self.stage.name):
             change = event.apply(due, self.state.model, self.state.moments, self.state.events[place])
             change = checked_change(change)
