@@ -10,9 +10,10 @@ from typing import Annotated
 import tyro
 from tyro.conf import Fixed, Positional, Suppress, UseAppendAction, arg
 
+from a2tg_jax.base.config_json import flatten_config
+from a2tg_jax.base.text import budget_in_bytes
 from a2tg_jax.cli.arguments import FLAGS, SCENE_IS_MISSING, DecidingOptions, LpipsWeights, defaulting_to, print_now
 from a2tg_jax.cli.processes import AUTO, ProcessPlace, joined
-from a2tg_jax.core.config_json import flatten_config
 from a2tg_jax.data.load import SceneSource
 from a2tg_jax.results.commands import file_command, resuming_command
 from a2tg_jax.results.folder import RunFolder, open_run, opened
@@ -92,7 +93,6 @@ class Train:
         from a2tg_jax import Session
         from a2tg_jax.base.machine import tidy_memory
         from a2tg_jax.cli import training
-        from a2tg_jax.core.budget import budget_in_bytes
         from a2tg_jax.results.forecast import room_for_photographs
         from a2tg_jax.results.history import tensorboard_library
         from a2tg_jax.results.run_processes import check_batch_sizes, follow_first_process
