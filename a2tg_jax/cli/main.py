@@ -25,6 +25,7 @@ OVERVIEW = """usage: a2tg COMMAND [OPTIONS]
 Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textured scene.
 
   a2tg demo                            train a built-in scene, about a minute on two cores
+  a2tg make photos/ --minutes 10       a page from photographs or a video, by the commands below
   a2tg sfm photos/ scene/              find camera poses for photographs or a video with COLMAP
   a2tg download --list                 benchmark data sets that can be downloaded
   a2tg train scene/ --out runs/scene --preset quick --downscale 4
@@ -47,7 +48,8 @@ and a2tg --version for the version. The systems: bytewise, a2tg, gaussians-2d,
 gaussians-2d-mcmc, textured-gaussians, supergaussians, bbsplat.
 Set A2TG_DEBUG=1 to see the traceback of an error."""
 COMMANDS = {
-    "demo": "train:Demo", "train": "train:Train", "eval": "runs:Eval", "finish": "runs:Finish", "render": "runs:Render",
+    "demo": "train:Demo", "make": "make:Make", "train": "train:Train", "eval": "runs:Eval", "finish": "runs:Finish",
+    "render": "runs:Render",
     "mesh": "runs:MeshCommand", "view": "runs:ViewCommand", "export": "runs:Export", "convert": "runs:Convert",
     "edit": "runs:EditCommand", "compare": "runs:Compare", "compress": "runs:Compress", "info": "runs:Info",
     "sfm": "inputs:Sfm", "download": "inputs:Download", "doctor": "doctor:Doctor",
