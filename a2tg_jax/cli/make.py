@@ -10,11 +10,11 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from a2tg_jax.base.checks import check_number
 from a2tg_jax.base.regular_files import is_regular
 from a2tg_jax.cli.arguments import defaulting_to, print_now
 from a2tg_jax.cli.main import parsed
 from a2tg_jax.cli.train import open_browser
-from a2tg_jax.core.checks import check_number
 from a2tg_jax.data.load import is_scene
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.minutes import choose_training

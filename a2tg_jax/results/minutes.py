@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax import Camera, Gaussians, Scene, init_from_points, load_scene, plan_render, render_image, view_image
-from a2tg_jax.base.text import in_bytes
+from a2tg_jax.base.text import counted, in_bytes
 
 BYTES_PER_PIXEL = 4.0
 """Bytes of the model for each pixel of a photograph: 0.3 MB at 320×240."""
@@ -75,9 +75,10 @@ class TimedTraining:
     @property
     def text(self) -> str:
         size = in_bytes(1e6 * self.memory_budget)
+        minutes = counted(max(1, round(self.seconds / 60)), "minute")
         return (
             f"photographs of {self.width}×{self.height} pixels, {size}, {self.iterations:,} iterations: about "
-            f"{self.seconds / 60:.0f} minutes, if this machine stays as busy as it is now"
+            f"{minutes}, if this machine stays as busy as it is now"
         )
 
 
