@@ -26,6 +26,7 @@ OVERVIEW = """usage: a2tg COMMAND [OPTIONS]
 Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textured scene.
 
   a2tg demo                            train a built-in scene, about a minute on two cores
+  a2tg make photos/ --minutes 10       a page from photographs or a video, by the commands below
   a2tg sfm photos/ scene/              find camera poses for photographs or a video with COLMAP
   a2tg download --list                 benchmark data sets that can be downloaded
   a2tg train scene/ --out runs/scene --preset quick --downscale 4
@@ -82,10 +83,11 @@ Examples:
   a2tg train synthetic --out runs/three --preset smoke --compare textured-gaussians --compare bbsplat
   a2tg train --config runs/fox/run.toml --out runs/again"""
 COMMANDS = {
-    "demo": "first_steps:Demo", "train": "train:Train", "eval": "runs:Eval", "finish": "runs:Finish",
-    "render": "runs:Render", "mesh": "runs:MeshCommand", "view": "runs:ViewCommand", "export": "runs:Export",
-    "convert": "runs:Convert", "edit": "runs:EditCommand", "compare": "runs:Compare", "compress": "runs:Compress",
-    "info": "runs:Info", "sfm": "inputs:Sfm", "download": "inputs:Download", "doctor": "first_steps:Doctor",
+    "demo": "first_steps:Demo", "make": "make:Make", "train": "train:Train", "eval": "runs:Eval",
+    "finish": "runs:Finish", "render": "runs:Render", "mesh": "runs:MeshCommand", "view": "runs:ViewCommand",
+    "export": "runs:Export", "convert": "runs:Convert", "edit": "runs:EditCommand", "compare": "runs:Compare",
+    "compress": "runs:Compress", "info": "runs:Info", "sfm": "inputs:Sfm", "download": "inputs:Download",
+    "doctor": "first_steps:Doctor",
 }  # fmt: skip
 """Module of `a2tg_jax.cli` and dataclass of each command."""
 WITHOUT_JAX = frozenset({"sfm", "download"})
