@@ -226,7 +226,7 @@ def test_density_control_reaches_its_cap_whatever_is_pruned(faint):
 )
 def test_a_trained_model_takes_its_budget_and_never_more(scene, name, budget):
     system = smoke(name, memory_budget=budget)
-    result = a2tg.fit(scene, system, progress=False)
+    result = a2tg.fit(scene, system)
     assert result.history.megabytes.max() <= system.memory_budget
     assert 0.995 * system.budget_bytes <= result.model.num_bytes <= system.budget_bytes
 
@@ -299,7 +299,7 @@ def test_budgets_that_the_points_of_a_scene_cannot_fill_are_refused(scene, name,
     system = smoke(name, **changes)
     advice = "raise stage1_iterations or initial_gaussians, or lower memory_budget"
     message = rf"^memory_budget has room for [\d,]+ Gaussians, but {message}.*: {advice}$"
-    for start in (check_start, lambda *it: a2tg.fit(*it, progress=False)):
+    for start in (check_start, a2tg.fit):
         with pytest.raises(ValueError, match=message):
             start(scene, system)
     check_start(scene, smoke(name, memory_budget="60kB"))
@@ -324,7 +324,7 @@ def test_a_budget_of_textures_is_checked_before_the_first_stage(scene, cap):
     texture = {"select": "budget", "budget_mb": 0.0297}
     system = smoke("a2tg", stage1_iterations=10, densify=densify, texture=texture)
     option = "densify.cap" if cap else "initial_gaussians"
-    for start in (check_start, lambda *it: a2tg.fit(*it, progress=False)):
+    for start in (check_start, a2tg.fit):
         with pytest.raises(ValueError, match=rf"but 120 Gaussians .* take 0\.030 MB: raise it, or lower {option}$"):
             start(scene, system)
     with pytest.raises(ValueError, match=r"but 120 Gaussians .*: raise it$"):

@@ -58,7 +58,7 @@ def test_every_mix_fills_its_bytes(scene, base_degree, shares):
     """Both shares at once have a test below."""
     view, texture = shares
     system = smoke(base_degree=base_degree, view_dependence_share=view, texture_share=texture)
-    result = a2tg.fit(scene, system, progress=False)
+    result = a2tg.fit(scene, system)
     model = result.model
     assert result.history.megabytes.max() <= 0.04
     assert 0.995 * 40_000 <= model.num_bytes <= 40_000
@@ -82,7 +82,7 @@ def before_details(scene):
     """A system, and the model of its first stage."""
     changes = {"view_dependence": {"at": (0.1,)}, "details": {"at": (0.2, 0.3)}}
     system = smoke(stage2_iterations=30, texture_share=0.02, view_dependence_share=0.1, **changes)
-    return system, a2tg.fit_stage(scene, system, 0, progress=False).model
+    return system, a2tg.fit_stage(scene, system, 0).model
 
 
 @pytest.mark.long
@@ -93,7 +93,7 @@ def test_details_have_their_room_before_they_come(scene, before_details, monkeyp
 
     def details():
         with compiled_programs("train_step") as programs:
-            result = a2tg.fit_stage(scene, system, 1, first, progress=False)
+            result = a2tg.fit_stage(scene, system, 1, first)
         assert result.history.megabytes.max() <= 0.04
         return result.model, len(programs) - result.num_regrown
 
@@ -121,10 +121,10 @@ def test_a_resumed_stage_has_its_room_again(scene, before_details, tmp_path):
         save_checkpoint(tmp_path / f"{checkpoint.iteration}.npz", checkpoint)
         stops.append(load_checkpoint(tmp_path / f"{checkpoint.iteration}.npz"))
 
-    whole = a2tg.fit_stage(scene, system, 1, first, progress=False, on_checkpoint=keep, checkpoint_every=4)
+    whole = a2tg.fit_stage(scene, system, 1, first, on_checkpoint=keep, checkpoint_every=4)
     for stop in stops[:2]:
         with compiled_programs("train_step") as programs:
-            rest = a2tg.fit_stage(scene, system, 1, resume=stop, progress=False)
+            rest = a2tg.fit_stage(scene, system, 1, resume=stop)
         assert len(programs) - rest.num_regrown <= 1, stop.iteration
         assert_same(rest.model, whole.model)
 
@@ -137,13 +137,13 @@ def test_the_highest_degree_is_kept():
 @pytest.mark.long
 def test_shapes_of_kernels_are_trained_in_both_stages_and_counted(scene, tmp_path):
     system = smoke(kernel_rate=0.02, **SHARES)
-    first = a2tg.fit_stage(scene, system, 0, progress=False).model
+    first = a2tg.fit_stage(scene, system, 0).model
     before = np.asarray(first.appearance.shapes)
     assert before.std() > 0.02 and before.max() > 0 > before.min()
-    resting = a2tg.fit_stage(scene, dataclasses.replace(system, kernel_rate=1e-9), 1, first, progress=False)
+    resting = a2tg.fit_stage(scene, dataclasses.replace(system, kernel_rate=1e-9), 1, first)
     after = resting.model.appearance.shapes
     np.testing.assert_allclose(after, before, atol=1e-6, err_msg="the second stage continues the first one's shapes")
-    result = a2tg.fit_stage(scene, system, 1, first, progress=False)
+    result = a2tg.fit_stage(scene, system, 1, first)
     model = result.model
     assert np.median(np.abs(np.asarray(model.appearance.shapes) - before)) > 0.01
     assert result.history.megabytes.max() <= 0.04 and 0.995 * 40_000 <= model.num_bytes <= 40_000
@@ -210,7 +210,7 @@ def test_compared_with_a2tg_both_keep_their_kernels_and_shares():
 @pytest.mark.long
 def test_the_least_exponent_reaches_both_stages(scene):
     system = smoke(kernel_rate=1.0, exponents={"least": 0.8}, **SHARES)
-    model = a2tg.fit(scene, system, progress=False).model
+    model = a2tg.fit(scene, system).model
     exponents = np.exp(np.tanh(model.appearance.shapes))[: model.num]
     np.testing.assert_allclose(exponents.min(), 0.8, rtol=1e-5)
     assert exponents.max() > 1

@@ -99,7 +99,7 @@ def test_points_of_one_colour_have_none_and_others_keep_theirs():
 @pytest.mark.long
 def test_a_channel_that_is_zero_in_all_points_is_learned():
     system = a2tg.Gaussians2dMcmc.preset("smoke", stage1_iterations=600)
-    model = a2tg.fit(with_colors(SCENE.colors * np.asarray([0, 1, 1])), system, progress=False).model
+    model = a2tg.fit(with_colors(SCENE.colors * np.asarray([0, 1, 1])), system).model
     view = SCENE.train[0]
     found, wanted = (np.clip(image[..., 0], 0, 1).mean() for image in (
         model.render(view.camera).color, a2tg.view_image(view)))  # fmt: skip

@@ -125,7 +125,7 @@ def test_exposures_change_nothing_on_average(trained):
 def test_a_resumed_run_is_the_same(scene, trained, tmp_path, place):
     result, checkpoints = trained
     save_checkpoint(tmp_path / "checkpoint.npz", checkpoints[place])
-    resumed = fit(scene, SYSTEM, resume=load_checkpoint(tmp_path / "checkpoint.npz"), progress=False).model
+    resumed = fit(scene, SYSTEM, resume=load_checkpoint(tmp_path / "checkpoint.npz")).model
     jax.tree.map(np.testing.assert_array_equal, resumed, result.model)
     assert resumed.origin == result.model.origin
 
@@ -160,7 +160,7 @@ def test_the_origin_has_the_cameras_as_they_were_refined(scene, trained, tmp_pat
 def test_a_checkpoint_of_another_number_of_views_is_refused(scene, trained):
     fewer = dataclasses.replace(scene, train=scene.train[1:])
     with pytest.raises(ValueError, match="corrections of 6 training views, but the scene has 5"):
-        fit(fewer, SYSTEM, resume=trained[1][0], progress=False)
+        fit(fewer, SYSTEM, resume=trained[1][0])
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
@@ -174,13 +174,13 @@ def test_every_system_has_them_and_none_has_by_default(name):
 @pytest.mark.long
 def test_batches_of_another_system_learn_them(scene):
     system = Gaussians2d(stage1_iterations=4, stage2_iterations=0, initial_gaussians=40, exposure=True, batch_size=2)
-    origin = fit(scene, system, progress=False).model.origin
+    origin = fit(scene, system).model.origin
     assert np.abs(origin.corrections["exposure"][: len(scene.train)] - np.eye(3, 4)).max() > 1e-3
 
 
 def test_a_system_that_does_not_learn_them_is_refused(scene):
     with pytest.raises(ValueError, match="refine_poses is on, but no stage of Toy learns it"):
-        fit(scene, Toy(refine_poses=True), progress=False)
+        fit(scene, Toy(refine_poses=True))
     with pytest.raises(ValueError, match=r"corrections.pose.rate must be at least 0"):
         corrections = dataclasses.replace(SYSTEM.corrections, pose=PoseRefinement(rate=-1.0))
         dataclasses.replace(SYSTEM, corrections=corrections).check()

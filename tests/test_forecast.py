@@ -288,9 +288,9 @@ def test_rows_beyond_the_machine_are_refused_before_they_are_allocated(monkeypat
         wanted = "densify.cap is too large for this machine "
     start = initial_model(scene, kind.preset("smoke"))
     for train in (
-        lambda: a2tg.fit(scene, system, progress=False),
-        lambda: a2tg.fit(scene, system, start=start, progress=False),
-        lambda: a2tg.fit_stage(scene, system, 0, progress=False),
+        lambda: a2tg.fit(scene, system),
+        lambda: a2tg.fit(scene, system, start=start),
+        lambda: a2tg.fit_stage(scene, system, 0),
     ):
         with pytest.raises(ValueError, match=f"^{wanted}.*Gaussians of 232 bytes, and 4 copies .* may be used: lower"):
             train()
@@ -322,8 +322,8 @@ def test_max_memory_allows_what_a_machine_does_not_report(monkeypatch):
     monkeypatch.setattr(machine, "memory_limit", lambda: 10**5)
     scene, system = a2tg.synthetic_scene(num_views=4), a2tg.Gaussians2dMcmc.preset("smoke", stage1_iterations=2)
     with pytest.raises(ValueError, match=r"densify\.cap is too large .* allow more with max_memory"):
-        a2tg.fit_stage(scene, system, 0, progress=False)
-    assert a2tg.fit_stage(scene, system, 0, progress=False, max_memory=10**12).model.num > 1
+        a2tg.fit_stage(scene, system, 0)
+    assert a2tg.fit_stage(scene, system, 0, max_memory=10**12).model.num > 1
 
 
 @pytest.mark.parametrize("group", ["texture", "view_dependence"])

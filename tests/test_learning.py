@@ -42,14 +42,14 @@ def frozen(scene, **changes):
 def test_a_warning_if_training_does_not_learn(scene):
     black, system = frozen(scene)
     with pytest.warns(UserWarning, match=r"does not learn: [\d.]+ dB .* after 200 iterations, .* flat colour .* try "):
-        a2tg.fit(black, system, progress=False)
+        a2tg.fit(black, system)
 
 
 @pytest.mark.long
 def test_no_warning_if_training_learns(scene):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        a2tg.fit(scene, a2tg.Gaussians2dMcmc(stage1_iterations=210, initial_opacity=0.5), progress=False)
+        a2tg.fit(scene, a2tg.Gaussians2dMcmc(stage1_iterations=210, initial_opacity=0.5))
 
 
 def checks_of(views, psnr, iterations=200, is_first=True, **options):
@@ -79,7 +79,7 @@ def test_long_first_stages_are_checked_once_after_a_fifth(scene):
 @pytest.mark.long
 def test_evaluation_knows_what_a_flat_colour_reaches(scene):
     black, system = frozen(scene, stage1_iterations=1)
-    found = a2tg.evaluate(scene.train, a2tg.fit(black, system, progress=False).model)
+    found = a2tg.evaluate(scene.train, a2tg.fit(black, system).model)
     assert not found.has_learned
     flat = [-10 * np.log10(np.mean((own - own.mean((0, 1))) ** 2)) for own in map(a2tg.view_image, scene.train)]
     assert found.flat_psnr == pytest.approx(np.mean(flat), rel=1e-4)

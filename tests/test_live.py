@@ -132,12 +132,12 @@ def test_a_training_that_is_looked_at_gives_the_same_bits():
             live._due = -np.inf  # A snapshot at every occasion.
             return live(run, is_stopped)
 
-        looked_at = fit_stage(SCENE, SYSTEM, 0, progress=False, session=Session(watch=watch))
+        looked_at = fit_stage(SCENE, SYSTEM, 0, session=Session(watch=watch))
         encoded(live)
     assert seen == [10, 20, 24] and addresses[0].startswith("http://127.0.0.1:")
     # Time in which a watcher holds the training is not counted.
     session = Session(watch=lambda run, is_stopped: 1000.0)
-    alone = fit_stage(SCENE, SYSTEM, 0, progress=False, session=session)
+    alone = fit_stage(SCENE, SYSTEM, 0, session=session)
     assert alone.seconds < -1000
     jax.tree.map(np.testing.assert_array_equal, looked_at.model, alone.model)
     with unseen(SCENE) as watch:

@@ -312,7 +312,7 @@ def tiny(side=16) -> a2tg.Scene:
 
 
 def trained(scene=None, **given):
-    return a2tg.fit(scene or tiny(), Own(given=given, loss=a2tg.LossConfig(ssim_weight=0)), progress=False)
+    return a2tg.fit(scene or tiny(), Own(given=given, loss=a2tg.LossConfig(ssim_weight=0)))
 
 
 def staged(**given):

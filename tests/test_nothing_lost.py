@@ -650,7 +650,7 @@ def test_a_finished_run_is_trained_on(tmp_path, monkeypatch, capsys):
     at_once = RunFolder(tmp_path / "at-once")
     assert cli.main([*TRAIN, "--more", "4", "4", "--out", str(at_once.path), "--quiet"]) == 0
     assert_same_bits(load_model(at_once.model(names[2])), models[2])
-    result = fit(SOURCE.load(), read_record(run).options, progress=False)
+    result = fit(SOURCE.load(), read_record(run).options)
     assert_same_bits(result.model, models[2])
     run.model(names[2]).unlink()
     assert cli.main([*resuming, "--more", "4"]) == 2

@@ -105,7 +105,7 @@ def test_training_gives_the_same_bits_wherever_photographs_are(tmp_path, monkeyp
     seen = []
     for scene in of_kind(tmp_path / "scene", "undistorted", None, 0):
         keep = lambda _: seen.append(num_readers())  # noqa: E731
-        models.append(fit(scene, SYSTEM, on_checkpoint=keep, progress=False).model)
+        models.append(fit(scene, SYSTEM, on_checkpoint=keep).model)
         assert seen.pop() > 0 == num_readers()
     assert_same(*(model.gaussians for model in models))
 
@@ -177,7 +177,7 @@ def test_a_photograph_that_does_not_stay_is_named(tmp_path, change):
     victim = folder / scene.train[2].name
     change(victim)
     with pytest.raises(ValueError, match=f"{victim.name}: (cannot be read|has changed since)"):
-        fit(scene, SYSTEM, progress=False)
+        fit(scene, SYSTEM)
     assert num_readers() == 0
 
 

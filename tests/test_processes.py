@@ -34,7 +34,7 @@ def test_two_processes_train_as_one(tmp_path):
     record = read_record(run)
     assert record.options.batch_size == 2
     first, _ = record.plan.main
-    alone = fit_stage(record.scene.load(), record.options, 0, progress=False)
+    alone = fit_stage(record.scene.load(), record.options, 0)
     np.testing.assert_allclose(read_history(run.history(first)).loss, alone.history.loss, rtol=1e-3)
     assert load_model(run.model(first)).num_bytes == alone.model.num_bytes
 
