@@ -17,6 +17,7 @@ from .appearance import (
     allocate_appearance as allocate_appearance,
     project_appearance as project_appearance,
 )
+from .base.checks import check_number as check_number
 from .base.machine import set_num_threads as set_num_threads
 from .core.bilinear import TextureRegion as TextureRegion
 from .core.camera_paths import look_at as look_at, path_through as path_through, smooth_path as smooth_path

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation, Slerp
 
+from a2tg_jax.base.checks import check_int
 from a2tg_jax.core.cameras import (
     Camera,
     camera_centers,
@@ -20,7 +21,6 @@ from a2tg_jax.core.cameras import (
     resize_camera,
     viewmat_of_axes,
 )
-from a2tg_jax.core.checks import check_int
 
 MIN_AXIS_SPREAD = 1e-3
 """Smallest eigenvalue of the mean of I - d·dᵀ (about the squared angle between axes) that fixes a point."""

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.core.checks import (
+from a2tg_jax.base.checks import (
     LARGEST_NUMBER,
     check_array,
     check_floats,
@@ -18,7 +18,7 @@ from a2tg_jax.core.checks import (
     make_plain,
     short_repr,
 )
-from a2tg_jax.core.named_fields import NamedFields
+from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.core.pytree import pytree, static
 
 LONGEST_SIDE = 100_000

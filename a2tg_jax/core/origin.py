@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from a2tg_jax.base.checks import check_bounded, check_floats, check_shape
+from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.text import shortened
 from a2tg_jax.core.camera_paths import vertical_of
 from a2tg_jax.core.cameras import MAX_SKEW, Camera, check_calibration
-from a2tg_jax.core.checks import check_bounded, check_floats, check_shape
-from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.similarity import Similarity, check_similarity
 
 Color = tuple[float, float, float]
