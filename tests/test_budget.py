@@ -29,7 +29,7 @@ from a2tg_jax import (
 )
 from a2tg_jax.base.config_json import config_from_dict, config_to_dict
 from a2tg_jax.cli import main as cli
-from a2tg_jax.core.budget import bytes_per_gaussian, number_to_reach
+from a2tg_jax.core.budget import number_to_reach
 from a2tg_jax.training import SYSTEMS
 from a2tg_jax.training.fitting import warn_of_budget
 from a2tg_jax.training.registry import system_from_dict, system_to_dict
@@ -143,7 +143,7 @@ def test_caps_use_up_every_budget(name):
     for budget, sh_degree in itertools.product(np.exp(rng.uniform(-4, 6, 10)), range(4)):
         degree = "base_degree" if name == "bytewise" else "sh_degree"
         system = dataclasses.replace(a2tg.find_system(name), memory_budget=float(budget), **{degree: sh_degree})
-        needed = bytes_per_gaussian(sh_degree, floats.get(name, 0))
+        needed = 4 * (10 + 3 * (sh_degree + 1) ** 2 + floats.get(name, 0))
         assert needed * filling(system).cap <= system.budget_bytes < needed * (filling(system).cap + 1)
 
 
@@ -311,7 +311,7 @@ def test_a_budget_of_textures_has_room_for_growth_only_where_there_is_some(scene
     system = a2tg.A2tg.preset("smoke", **changes)
     with pytest.raises(ValueError, match=r"0\.03, but \d+ Gaussians .*: raise it, or lower densify\.cap$"):
         check_start(scene, system)
-    most = 30_000 // bytes_per_gaussian(system.sh_degree, 4)
+    most = 30_000 // (4 * (10 + 3 * (system.sh_degree + 1) ** 2 + 4))
     system.check_given_number(most)
     with pytest.raises(ValueError, match=rf"0\.03, but {most + 1} Gaussians of one texel each .* MB: raise it$"):
         system.check_given_number(most + 1)

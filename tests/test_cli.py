@@ -25,12 +25,11 @@ from small_models import origin_of
 
 from a2tg_jax import find_system, load_model, load_ply, save_model
 from a2tg_jax.cli import doctor, main as cli
-from a2tg_jax.cli.train import Train, train_defaults
+from a2tg_jax.cli.train import train_defaults
 from a2tg_jax.data.load import SceneSource
 from a2tg_jax.host import startup
 from a2tg_jax.results import finishing, page_export, run_training, stage_training
 from a2tg_jax.results.folder import RunFolder
-from a2tg_jax.results.frames import LIST
 from a2tg_jax.results.history import read_history
 from a2tg_jax.results.model_source import open_source
 from a2tg_jax.results.record import read_record, write_record
@@ -218,7 +217,7 @@ texture_side = 2
 """
 
 
-def parsed_with_file(folder, text: str, *flags: str) -> Train:
+def parsed_with_file(folder, text: str, *flags: str):
     (folder / "mine.toml").write_text(text)
     return cli.parsed("train", ["--config", str(folder / "mine.toml"), "--out", "run", *flags])
 
@@ -583,7 +582,7 @@ def test_flights_without_ffmpeg(run, tmp_path, monkeypatch, capsys):
     command = ["render", str(run.path), "--out", str(tmp_path), "--size", "48x20", "--fps", "8", "--frames"]
     for num, names in ((4, others | {"frame_0002.png", "frame_0003.png"}), (2, others)):
         assert cli.main([*command, str(num)]) == 0
-        made = {"frame_0000.png", "frame_0001.png", "flight.webp", LIST}
+        made = {"frame_0000.png", "frame_0001.png", "flight.webp", ".a2tg-frames"}
         assert {path.name for path in tmp_path.iterdir()} == names | made
     printed = capsys.readouterr().out
     assert (

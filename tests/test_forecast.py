@@ -302,12 +302,12 @@ def test_a_later_stage_beyond_the_machine_is_refused_before_the_first(monkeypatc
     limits = {first: 4 * forecast.model_bytes for first, forecast in enumerate(forecast_stages(scene, system))}
     assert limits[0] < limits[1] == 4 * MB
     monkeypatch.setattr(machine, "memory_limit", lambda: limits[1])
-    check_rows_fit(scene, system, 0, None, machine.ALONE)
+    check_rows_fit(scene, system, 0, None, machine.Devices())
     monkeypatch.setattr(machine, "memory_limit", lambda: limits[1] - 1)
     for first, num_start in ((0, None), (1, 3205)):
         with pytest.raises(ValueError, match=r"stage 'textures' trains up to 3,205 .* at least 4.00 MB"):
-            check_rows_fit(scene, system, first, num_start, machine.ALONE)
-    check_rows_fit(scene, system, 0, None, machine.ALONE, max_memory=limits[1])
+            check_rows_fit(scene, system, first, num_start, machine.Devices())
+    check_rows_fit(scene, system, 0, None, machine.Devices(), max_memory=limits[1])
     check_rows_fit(scene, system, 0, None, machine.Devices(1, 2))  # Other machines' memory is not known.
 
 
@@ -315,7 +315,7 @@ def test_the_start_is_named_if_it_is_too_large(monkeypatch):
     monkeypatch.setattr(machine, "memory_limit", lambda: 10**6)
     system = a2tg.Gaussians2dMcmc.preset("smoke", densify=a2tg.Mcmc(cap=0))
     with pytest.raises(ValueError, match=r"^start is too large .* up to 2,000 Gaussians"):
-        check_rows_fit(SMALL, system, 0, 2000, machine.ALONE)
+        check_rows_fit(SMALL, system, 0, 2000, machine.Devices())
 
 
 def test_max_memory_allows_what_a_machine_does_not_report(monkeypatch):

@@ -784,7 +784,7 @@ def test_a_matrix_product_in_shade_is_composited_by_xla(monkeypatch):
         found = drawn(MIXED, "auto")
     np.testing.assert_allclose(found, drawn(MIXED_BY_HAND, "auto"), atol=1e-5)
     monkeypatch.setitem(platforms.PLATFORMS, "cuda", "cpu")
-    monkeypatch.setattr(platforms.nvrtc, "find", lambda: True)
+    monkeypatch.setattr("a2tg_jax.rasterize.kernels.cuda.nvrtc.find", lambda: True)
     for name in ("native", "cuda"):
         with pytest.raises(
             ValueError, match=rf"compositor='{name}' cannot run Mixed: .*{printed_text}\. Say 'xla', or 'auto'"

@@ -16,6 +16,7 @@ from small_values import some_gaussians
 from a2tg_jax import (
     AdaptDegrees,
     Appearance,
+    Camera,
     Due,
     Exponents,
     Gaussians2dMcmc,
@@ -36,10 +37,10 @@ from a2tg_jax import (
     save_model,
     save_ply,
 )
-from a2tg_jax.appearance.parts import empty_bands, floats_of_band, sizes_of_degrees
+from a2tg_jax.appearance.parts import floats_of_band, sizes_of_degrees
 from a2tg_jax.core.budget import within_budget
 from a2tg_jax.core.table import Shape, bucket_capacity, resize
-from a2tg_jax.densify.view_dependence import BandStatistics, most_blocks, raised_degrees, without_idle
+from a2tg_jax.densify.view_dependence import most_blocks, raised_degrees, without_idle
 from a2tg_jax.training.start import padded
 
 NUM = 40
@@ -175,7 +176,14 @@ def test_the_gradient_of_missing_coefficients_is_that_of_coefficients_that_are_z
     centers = rng.normal(size=(6, 3)) + 5
     colors = rng.normal(size=(6, NUM, 3)).astype(np.float32)
     as_array = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
-    state = BandStatistics.init(NUM).observe(as_array(means), as_array(centers), as_array(colors))
+    model = Model(dataclasses.replace(some_gaussians(NUM), means=as_array(means)))
+    viewmats = np.tile(np.eye(4), (6, 1, 1))
+    viewmats[:, :3, 3] = -centers
+    cameras = Camera(as_array(viewmats), jnp.tile(jnp.eye(3), (6, 1, 1)), 4, 3)
+    nothing = jnp.zeros((6, NUM, 3))
+    event = AdaptDegrees(1.0)
+    seen = Seen(cameras, nothing, nothing[..., 0] > 0, as_array(colors))
+    state = event.observe(event.init(model), model, seen)
     expected = np.zeros((NUM, 16, 3))
     for center, color in zip(centers, colors, strict=True):
         for i in range(NUM):
@@ -203,8 +211,9 @@ def test_idle_bands_are_given_up():
     dense[2, :3] = dense[3, :3] = 1.0
     gaussians = some_gaussians(4)
     bands = with_bands(Model(dataclasses.replace(gaussians, sh=gaussians.sh[:, :1])), dense, degrees)
+    idle = with_bands(bands, np.zeros_like(dense), degrees)
     np.testing.assert_array_equal(without_idle(bands.appearance.coefficients, 0, 0.01), [0, 0, 1, 1])
-    np.testing.assert_array_equal(without_idle(empty_bands(degrees, 0), 0, 0.0), degrees)
+    np.testing.assert_array_equal(without_idle(idle.appearance.coefficients, 0, 0.0), degrees)
 
 
 @pytest.mark.parametrize("budget_mb", [0.0031])
@@ -226,7 +235,9 @@ def test_an_event_stays_within_its_budget_and_spends_it(budget_mb):
 @pytest.mark.parametrize("base, highest, num_bytes", [(0, 2, 5_000), (1, 3, 900), (0, 3, 100_000)])
 def test_there_is_room_for_all_degrees_that_fit(base, highest, num_bytes):
     """Any degrees within the bytes fit the shape that is planned before, which has few rows to spare."""
-    empty = empty_bands(np.full(NUM, base), base)
+    gaussians = some_gaussians(NUM)
+    low = Model(dataclasses.replace(gaussians, sh=gaussians.sh[:, : (base + 1) ** 2]))
+    empty = with_bands(low, np.zeros((NUM, 16 - (base + 1) ** 2, 3)), np.full(NUM, base)).appearance.coefficients
     room = most_blocks(num_bytes, base, highest, NUM, empty)
     expected = {(0,): bucket_capacity(NUM)}
     for favourite in range(base + 1, highest + 1):  # As many of one degree as fit.

@@ -40,7 +40,7 @@ from a2tg_jax.results.record import RunRecord, SceneSource, write_record
 from a2tg_jax.results.viewing import CameraPhotographs, routes_of
 from a2tg_jax.web import server
 from a2tg_jax.web.page import viewer_html, viewer_html_with
-from a2tg_jax.web.server import ANY, Door, Route, application, lan_address, serve, served
+from a2tg_jax.web.server import Door, Route, application, lan_address, serve, served
 
 
 def ask(app, path="/", method="GET", host="127.0.0.1:80"):
@@ -181,13 +181,13 @@ def network_app(door):
 
 
 def test_on_a_network_nothing_is_told_without_the_token():
-    app = network_app(Door(ANY, ANY, 80, "secret"))
+    app = network_app(Door("0.0.0.0", "0.0.0.0", 80, "secret"))
     for path in ("/", "", "/scene", "/secret", "/Secret/", "/secre/", "/secret2/scene", "//secret/"):
         assert [ask(app, path, method=method)[0] for method in ("GET", "POST")] == [403, 403], path
 
 
 def test_on_a_network_the_token_opens_the_page_and_what_it_fetches():
-    app = network_app(Door(ANY, ANY, 80, "secret"))
+    app = network_app(Door("0.0.0.0", "0.0.0.0", 80, "secret"))
     asked = {path: ask(app, path, host="192.168.1.7:80") for path in ("/secret/", "/secret/scene", "/secret/none")}
     assert {path: (status, body) for path, (status, _, body) in asked.items()} == {
         "/secret/": (200, b"page"),
@@ -203,7 +203,12 @@ def test_on_a_network_the_token_opens_the_page_and_what_it_fetches():
 @pytest.mark.parametrize(
     ("name", "address", "let_in", "kept_out"),
     [
-        (ANY, ANY, "192.168.1.7:80 localhost:80", "evil.example:80 192.168.1.7:81 192.168.1.7.evil.example:80"),
+        (
+            "0.0.0.0",
+            "0.0.0.0",
+            "192.168.1.7:80 localhost:80",
+            "evil.example:80 192.168.1.7:81 192.168.1.7.evil.example:80",
+        ),
         ("192.168.1.7", "192.168.1.7", "192.168.1.7:80", "192.168.1.8:80"),
         ("desk.local", "192.168.1.7", "desk.local:80 192.168.1.7:80", "evil.example:80"),
     ],
@@ -218,7 +223,7 @@ def test_a_server_on_a_network_has_a_new_token_each_time(monkeypatch):
     monkeypatch.setattr("a2tg_jax.web.server.lan_address", lambda: "192.168.1.7")
     tokens = []
     for _ in range(2):
-        with served({"/": Route("text/plain", b"here")}, host=ANY) as address:
+        with served({"/": Route("text/plain", b"here")}, host="0.0.0.0") as address:
             port, token = re.fullmatch(r"http://192\.168\.1\.7:(\d+)/([\w-]{20,})/", address).groups()
             for path, status in (("/", 403), (f"/{token}/", 200)):
                 connection = http.client.HTTPConnection("127.0.0.1", int(port), timeout=20)
