@@ -21,7 +21,6 @@ from a2tg_jax.cli import main as cli
 from a2tg_jax.cli.train import ask
 from a2tg_jax.host import progress_bars
 from a2tg_jax.results import forecast
-from a2tg_jax.results.commands import quick_flags
 from a2tg_jax.results.forecast import (
     Bytes,
     RunForecast,
@@ -209,25 +208,24 @@ def test_a_system_names_its_own_limit(system, option):
 
 
 @pytest.mark.parametrize(
-    ("preset", "size", "flags"),
+    ("preset", "downscale", "size", "flags"),
     [
-        ("paper", (1600, 1067), "--preset quick --downscale 6"),
-        ("paper", (320, 213), "--preset quick --downscale 2"),
-        ("quick", (3200, 2133), "--preset quick --downscale 10"),
-        ("quick", (320, 213), None),
+        ("paper", 2, (1600, 1067), "--preset quick --downscale 6"),
+        ("paper", 2, (320, 213), "--preset quick --downscale 2"),
+        ("paper", 1, (100, 67), "--preset quick"),
+        ("paper", 1, (640, 427), "--preset quick"),
+        ("paper", 1, (641, 427), "--preset quick --downscale 2"),
+        ("paper", 1, (4000, 2667), "--preset quick --downscale 7"),
+        ("quick", 2, (3200, 2133), "--preset quick --downscale 10"),
+        ("quick", 2, (320, 213), None),
     ],
 )
-def test_the_forecast_of_a_long_run_has_quicker_flags(monkeypatch, tmp_path, preset, size, flags):
+def test_the_forecast_of_a_long_run_has_quicker_flags(monkeypatch, tmp_path, preset, downscale, size, flags):
     monkeypatch.setattr(machine, "memory_limit", lambda: 10**12)
-    record = RunRecord(SceneSource("fox", downscale=2), "a2tg", a2tg.A2tg.preset(preset), preset=preset)
+    record = RunRecord(SceneSource("fox", downscale=downscale), "a2tg", a2tg.A2tg.preset(preset), preset=preset)
     text = checked_forecast(scene_of(*size), record, None, out=tmp_path)
     assert text.endswith(f"\nquicker on CPUs: {flags} takes minutes") == (flags is not None)
     assert "quicker" not in checked_forecast(scene_of(*size), record, None), "a resumed run keeps its options"
-
-
-def test_the_downscale_of_quick_runs():
-    downscales = {100: "", 640: "", 641: " --downscale 2", 4000: " --downscale 7"}
-    assert {side: quick_flags(side).removeprefix("--preset quick") for side in downscales} == downscales
 
 
 def test_a_forecast_is_two_lines_of_text(monkeypatch):

@@ -33,7 +33,6 @@ from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.results import run_training
 from a2tg_jax.results.record import RunRecord, write_record
 from a2tg_jax.training import corrections, losses, options
-from a2tg_jax.training.checkpoint import check_resume
 from a2tg_jax.training.start import initial_model
 
 
@@ -679,7 +678,11 @@ def test_a_redefined_class_is_another_one():
         return Redefined
 
     with pytest.raises(ValueError, match=r"before it was defined again\): resume with checkpoint.system, or"):
-        check_resume(Checkpoint(defined()(), 0, None, History.empty()), defined()(), 0)
+        a2tg.fit(
+            dataclasses.replace(SCENE, train=(VIEW,)),
+            defined()(),
+            resume=Checkpoint(defined()(), 0, None, History.empty()),
+        )
 
 
 def test_a_capacity_that_is_too_small_warns_eagerly():
