@@ -1,4 +1,4 @@
-"""Memory budgets: how they are written, what they lead to on the host, and that no training exceeds or misses one."""
+"""Memory budgets: how they are written, what they lead to on the host, and what is said of models that miss one."""
 
 import dataclasses
 import itertools
@@ -36,13 +36,6 @@ from a2tg_jax.training.registry import system_from_dict, system_to_dict
 from a2tg_jax.training.start import check_start
 
 SHORT = {"stage1_iterations": 60, "initial_gaussians": None}
-BUDGETS = {
-    "a2tg": "61kB",
-    "gaussians-2d": "46.6kB",
-    "gaussians-2d-mcmc": "0.12",
-}
-"""Small, and such that what is less than one more Gaussian is less than half a percent. The other systems train within
-a budget in `test_systems`."""
 
 
 @pytest.fixture(scope="module")
@@ -218,17 +211,6 @@ def test_density_control_reaches_its_cap_whatever_is_pruned(faint):
         num_live = len(kept) + len(doubled)
         assert num_live == wanted
     assert num_live == num
-
-
-@pytest.mark.parametrize(
-    "name, budget",
-    [pytest.param(*item, marks=[] if item[0] == "gaussians-2d-mcmc" else pytest.mark.long) for item in BUDGETS.items()],
-)
-def test_a_trained_model_takes_its_budget_and_never_more(scene, name, budget):
-    system = smoke(name, memory_budget=budget)
-    result = a2tg.fit(scene, system)
-    assert result.history.megabytes.max() <= system.memory_budget
-    assert 0.995 * system.budget_bytes <= result.model.num_bytes <= system.budget_bytes
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ from a2tg_jax import (
     load_checkpoint,
     save_checkpoint,
 )
-from a2tg_jax.results.record import compared_system
+from a2tg_jax.results.record import RunRecord, SceneSource
 from a2tg_jax.training.start import initial_model, padded
 from a2tg_jax.training.step import jitted_step
 
@@ -185,25 +185,31 @@ def test_given_gaussians_must_leave_bytes_for_details(limit, shares, most):
     Bytewise.preset("quick", view_dependence_share=0.0, texture_share=0.0).check_given_number(100_000)
 
 
+def compared(name, other, preset="quick"):
+    """A system in a run that compares it with another."""
+    record = RunRecord(SceneSource("synthetic"), "other", other, (name,), preset)
+    return record.systems[name]
+
+
 def test_compared_with_another_system_it_keeps_its_degrees():
-    compared = compared_system("bytewise", a2tg.A2tg.preset("quick"), "quick")
-    assert compared.initial_sh_degree == 0 and compared.sh_degree == 3
+    system = compared("bytewise", a2tg.A2tg.preset("quick"))
+    assert system.initial_sh_degree == 0 and system.sh_degree == 3
     # Plain Gaussians of degree 0 are the strongest at equal bytes, and those that it begins with.
-    plain = compared_system("gaussians-2d-mcmc", Bytewise.preset("quick"), "quick")
+    plain = compared("gaussians-2d-mcmc", Bytewise.preset("quick"))
     assert (plain.initial_sh_degree, plain.densify.cap) == (0, Bytewise.preset("quick").densify.cap)
-    assert compared_system("gaussians-2d-mcmc", a2tg.A2tg.preset("quick"), "quick").initial_sh_degree == 3
+    assert compared("gaussians-2d-mcmc", a2tg.A2tg.preset("quick")).initial_sh_degree == 3
 
 
 def test_compared_with_a2tg_both_keep_their_kernels_and_shares():
     """Options of the same names, which mean nothing for the other."""
     own = Bytewise.preset("quick")
     textured = a2tg.A2tg.preset("quick", kernel_rate=0.02, texture_share=0.3)
-    compared = compared_system("bytewise", textured, "quick")
-    assert (compared.kernel_rate, compared.texture_share) == (own.kernel_rate, own.texture_share)
-    compared = compared_system("a2tg", own, "quick")
-    assert (compared.kernel_rate, compared.texture_share) == (0.01, 0.25), "its own of quick"
-    compared = compared_system("a2tg", own)
-    assert (compared.kernel_rate, compared.texture_share) == (None, None)
+    system = compared("bytewise", textured)
+    assert (system.kernel_rate, system.texture_share) == (own.kernel_rate, own.texture_share)
+    system = compared("a2tg", own)
+    assert (system.kernel_rate, system.texture_share) == (0.01, 0.25), "its own of quick"
+    system = compared("a2tg", own, preset=None)
+    assert (system.kernel_rate, system.texture_share) == (None, None)
 
 
 @pytest.mark.long

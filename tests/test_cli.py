@@ -23,7 +23,7 @@ from run_folders import create_run
 from small_files import taken_apart
 from small_models import origin_of
 
-from a2tg_jax import find_system, load_model, load_ply, save_model
+from a2tg_jax import configure_cpu, find_system, load_model, load_ply, save_model
 from a2tg_jax.cli import doctor, main as cli
 from a2tg_jax.cli.train import train_defaults
 from a2tg_jax.data.load import SceneSource
@@ -258,16 +258,27 @@ def test_own_systems_are_found_in_the_current_directory(tmp_path, monkeypatch):
 # Settings of JAX
 
 
-def test_flags_of_xla(monkeypatch):
+KEPT_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
+WIDE = "--xla_cpu_prefer_vector_width=512"
+
+
+@pytest.mark.parametrize(
+    ("version", "features", "flags"),
+    [
+        ((0, 12), {"avx512f"}, [KEPT_LOOPS, WIDE]),
+        ((0, 11), set(), [KEPT_LOOPS]),
+        ((0, 10), {"avx512f"}, [KEPT_LOOPS, WIDE, "--xla_cpu_use_fusion_emitters=false"]),
+        ((9, 9), {"avx512f"}, []),
+    ],
+)
+def test_flags_of_xla(monkeypatch, version, features, flags):
     """They fit the processor and the version; the user's own stay."""
-    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_prefer_vector_width=256 --xla_dump_to=x")
-    startup.add_xla_flags(("--xla_cpu_prefer_vector_width=512", "--xla_other=1"))
-    assert os.environ["XLA_FLAGS"] == "--xla_cpu_prefer_vector_width=256 --xla_dump_to=x --xla_other=1"
-    avx512 = frozenset({"avx512f"})
-    assert startup.cpu_flags(avx512, (0, 12)) == (startup.WHOLE_LOOPS_FLAG, startup.WIDE_VECTORS_FLAG)
-    assert startup.cpu_flags(frozenset(), (0, 11)) == (startup.WHOLE_LOOPS_FLAG,)
-    assert startup.cpu_flags(avx512, (0, 10)) == (*startup.cpu_flags(avx512, (0, 12)), startup.OLD_FUSIONS_FLAG)
-    assert startup.cpu_flags(avx512, (9, 9)) == ()
+    monkeypatch.setattr(startup, "processor_features", lambda: frozenset(features))
+    monkeypatch.setattr(jax, "__version_info__", (*version, 0))
+    for given, added in (("--xla_dump_to=x", flags), (f"{WIDE[:-3]}256", [flag for flag in flags if flag != WIDE])):
+        monkeypatch.setenv("XLA_FLAGS", given)
+        configure_cpu(use_cache=False)
+        assert os.environ["XLA_FLAGS"].split() == [given, *added]
 
 
 CACHED = """
@@ -296,13 +307,16 @@ def test_programs_are_kept_and_read_again_in_silence(tmp_path, monkeypatch):
 
 def test_a_user_who_asks_for_the_log_gets_it(monkeypatch):
     asked = []
+    monkeypatch.setattr(startup, "processor_features", lambda: frozenset({"avx512f"}))
+    monkeypatch.setattr(jax, "__version_info__", (0, 11, 0))
     monkeypatch.setattr(jax.config, "update", lambda *given: asked.append(given))
+    monkeypatch.setenv("XLA_FLAGS", os.environ["XLA_FLAGS"])
     monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "0")
-    startup.silence_xla()
-    assert not asked
+    configure_cpu()
+    assert [name for name, _ in asked] == ["jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs"]
     monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "1")
-    startup.silence_xla()
-    assert asked == [("jax_logging_level", "CRITICAL"), ("jax_logging_level", "NOTSET")]
+    configure_cpu()
+    assert asked[4:] == [("jax_logging_level", "CRITICAL"), ("jax_logging_level", "NOTSET")]
 
 
 # A whole run

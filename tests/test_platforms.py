@@ -19,7 +19,7 @@ from a2tg_jax.rasterize.kernels.platforms import by_platform
 from a2tg_jax.training.losses import mean_ssim
 
 NATIVE = r"custom_call @a2tg_"
-CUDA = rf"custom_call @{re.escape(composite.TARGET)}"
+CUDA = rf"custom_call @{re.escape('__gpu$xla.gpu.ptx')}"
 
 
 def image(gaussians, textures=None, **settings):
