@@ -360,18 +360,32 @@ def test_programs_are_kept_and_read_again_in_silence(tmp_path, monkeypatch):
     assert counts[0] == counts[1] > 0
 
 
+@pytest.fixture
+def no_cache():
+    """JAX keeps no programs on disk, whatever commands of this process asked for before."""
+    folder = jax.config.values["jax_compilation_cache_dir"]
+    jax.config.update("jax_compilation_cache_dir", None)
+    yield
+    jax.config.update("jax_compilation_cache_dir", folder)
+
+
+@pytest.mark.usefixtures("no_cache")
 def test_a_user_who_asks_for_the_log_gets_it(monkeypatch):
     asked = []
     monkeypatch.setattr(startup, "processor_features", lambda: frozenset({"avx512f"}))
     monkeypatch.setattr(jax, "__version_info__", (0, 11, 0))
-    monkeypatch.setattr(jax.config, "update", lambda *given: asked.append(given))
     monkeypatch.setenv("XLA_FLAGS", os.environ["XLA_FLAGS"])
-    monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "0")
-    configure_cpu()
-    assert [name for name, _ in asked] == ["jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs"]
-    monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "1")
-    configure_cpu()
-    assert asked[4:] == [("jax_logging_level", "CRITICAL"), ("jax_logging_level", "NOTSET")]
+    with monkeypatch.context() as patch:
+        patch.setattr(jax.config, "update", lambda *given: asked.append(given))
+        patch.setenv("TF_CPP_MIN_LOG_LEVEL", "0")
+        configure_cpu()
+        assert [name for name, _ in asked] == [
+            "jax_compilation_cache_dir",
+            "jax_persistent_cache_min_compile_time_secs",
+        ]
+        patch.setenv("TF_CPP_MIN_LOG_LEVEL", "1")
+        configure_cpu()
+        assert asked[4:] == [("jax_logging_level", "CRITICAL"), ("jax_logging_level", "NOTSET")]
 
 
 # A whole run

@@ -478,7 +478,9 @@ def test_photographs_are_those_of_the_cameras():
     ("error", "printed"),
     [(FileNotFoundError("no folder"), "photographs of"), (ValueError("a.png: is truncated"), r"a\.png: is truncated")],
 )
-def test_photographs_that_cannot_be_read_are_not_called_missing(tmp_path, monkeypatch, capsys, error, printed):
+def test_photographs_that_cannot_be_read_are_not_called_missing(
+    tmp_path, monkeypatch, untouched_jax, capsys, error, printed
+):
     """The viewer and the page go on without them, with a warning; what needs them tells the error."""
 
     def fail(self):
