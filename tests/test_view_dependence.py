@@ -38,7 +38,7 @@ from a2tg_jax import (
 )
 from a2tg_jax.appearance.parts import empty_bands, floats_of_band, sizes_of_degrees
 from a2tg_jax.core.budget import within_budget
-from a2tg_jax.core.table import Shape, bucket_capacity, resize
+from a2tg_jax.core.table import Layout, bucket_capacity, resize
 from a2tg_jax.densify.view_dependence import BandStatistics, most_blocks, raised_degrees, without_idle
 from a2tg_jax.training.start import padded
 
@@ -237,11 +237,11 @@ def test_there_is_room_for_all_degrees_that_fit(base, highest, num_bytes):
     assert dict(zip(*room, strict=True)) == expected
     degrees = np.random.default_rng(highest).integers(base, highest + 1, NUM)
     sizes = sizes_of_degrees(degrees, base)
-    wide = Shape(room.sizes, (bucket_capacity(NUM),) * len(room.sizes))
+    wide = Layout(room.sizes, (bucket_capacity(NUM),) * len(room.sizes))
     table, _ = resize(empty, sizes, room=wide)
-    assert table.shape == wide
+    assert table.layout == wide
     np.testing.assert_array_equal(table.sizes, sizes)
-    table, _ = resize(table, sizes, room=Shape(room.sizes, (1,) * len(room.sizes)))
+    table, _ = resize(table, sizes, room=Layout(room.sizes, (1,) * len(room.sizes)))
     np.testing.assert_array_equal(table.sizes, sizes)
 
 

@@ -20,7 +20,7 @@ from a2tg_jax.base.machine import Devices
 from a2tg_jax.base.text import in_bytes
 from a2tg_jax.core.compilations import compilations
 from a2tg_jax.core.numerics import evenly_chosen
-from a2tg_jax.core.table import Shape
+from a2tg_jax.core.table import Layout
 from a2tg_jax.events import Due, Event, HostEvent, StepEvent
 from a2tg_jax.model import Model
 from a2tg_jax.parallel import any_process, check_batch_size, divided, everywhere, mesh_of, num_processes, whole
@@ -123,7 +123,7 @@ class Session:
         processes = num_processes(self.mesh)
         self.devices = Devices(self.num_devices // processes, processes)
         """Numbers of devices of a process and of processes."""
-        self.shapes: set[Shape] = set()
+        self.layouts: set[Layout] = set()
         """Shapes of textures."""
         self.room = TileRoom()
         """Capacities of tile lists, by appearance, rows and image size."""
@@ -443,7 +443,7 @@ class StageRun:
     def _apply(self, place: int, event: HostEvent, index: int, count: int) -> None:
         """Apply the event at a place, for the `index`-th of `count` times."""
         background = BACKGROUNDS[self.system.background]
-        due = Due(index, count, self.views, background, self.system.seed, self.session.shapes)
+        due = Due(index, count, self.views, background, self.system.seed, self.session.layouts)
         with calling(event, "apply", self.stage.name):
             change = event.apply(due, self.state.model, self.state.moments, self.state.events[place])
             change = checked_change(change)
