@@ -17,7 +17,7 @@ from tyro.conf import Fixed, Positional, Suppress, UseAppendAction, arg
 
 from a2tg_jax import A2tg, Mcmc, Scene, Session, Upscale
 from a2tg_jax.base.config_json import flatten_config
-from a2tg_jax.base.machine import tidy_memory
+from a2tg_jax.base.memory import tidy_memory
 from a2tg_jax.base.operating_system import has_display
 from a2tg_jax.base.regular_files import expanded
 from a2tg_jax.base.text import budget_in_bytes, counted

@@ -20,7 +20,7 @@ import zstandard
 from PIL import Image
 
 from a2tg_jax.appearance.parts import MOST_TANH
-from a2tg_jax.base.json_text import numbers_of
+from a2tg_jax.base.json_text import number_array
 
 Precision = int | Literal["float32", "float16"]
 Choice = Literal["smallest", "lzma", "zstd", "webp", "deflate", "none"]
@@ -485,7 +485,7 @@ class ColumnReader:
         return _finite("means", np.stack(axes))
 
     def _ends(self, name: str, count: int) -> list[float]:
-        return numbers_of(self._ends_by_name[name], count, f"the ends of {name}").tolist()
+        return number_array(self._ends_by_name[name], count, f"the ends of {name}").tolist()
 
 
 def _finite(name: str, values: np.ndarray, dtype: Any = np.float32) -> np.ndarray:

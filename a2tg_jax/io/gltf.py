@@ -16,7 +16,7 @@ from a2tg_jax import Appearance, Bands, Exponents, Model, Texture, TextureOption
 from a2tg_jax.appearance.parts import MAX_DEGREE
 from a2tg_jax.base.checks import check_int, check_literal
 from a2tg_jax.base.config_json import config_from_dict
-from a2tg_jax.base.json_text import numbers_of
+from a2tg_jax.base.json_text import number_array
 from a2tg_jax.base.regular_files import expanded, reading
 from a2tg_jax.base.suffixes import check_suffix
 from a2tg_jax.base.text import shortened
@@ -326,7 +326,7 @@ def _texels(document: Document, described: Mapping[str, Any], count: int) -> np.
     if len(texels) != count:
         raise ValueError(f"{EXTENSION}.sizes need {count} texels, but there are {len(texels)}")
     for name, columns in RANGES.items() if "texelRanges" in described else ():
-        ends = numbers_of(described["texelRanges"][name], 2, f"{EXTENSION}.texelRanges.{name}").tolist()
+        ends = number_array(described["texelRanges"][name], 2, f"{EXTENSION}.texelRanges.{name}").tolist()
         texels[:, columns] = dequantised(texels[:, columns] * 255.0, Ends(*ends), 8)
     return texels
 

@@ -324,15 +324,16 @@ class StageRun:
         arguments = self.arguments(iteration)
         started = time.perf_counter()
         info: StepInfo
-        with compilations() as programs:
+        with compilations() as phases:
             try:
                 if self.memory is None:
                     self.memory = self._memory_of(arguments)
                 self.state, info = jitted_step()(*arguments)
             except ValueError as error:  # The step is not compiled for the name of its stage.
                 raise ValueError(f"stage {self.stage.name!r}: {error}") from error
-        self.effects.launch(iteration, time.perf_counter() - started if programs else None)
-        if programs:
+        is_compiled = any(phase.makes_code for phase in phases)
+        self.effects.launch(iteration, time.perf_counter() - started if is_compiled else None)
+        if is_compiled:
             self.session.after_compiling()
         return info
 
