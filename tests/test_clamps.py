@@ -23,7 +23,6 @@ from a2tg_jax import (
     partition,
     project_appearance,
 )
-from a2tg_jax.appearance.parts import LARGEST_LOG_EXPONENT
 from a2tg_jax.core.numerics import at_least, within
 from a2tg_jax.training.start import initial_model
 
@@ -162,7 +161,7 @@ def test_alphas_at_their_cap_can_fade():
 def test_exponents_at_their_limit_have_a_gradient():
     gaussians = some_gaussians(5)
     settings = a2tg.RenderSettings(capacity=1024)
-    limit = jnp.full(5, np.arctanh(np.log(0.6) / LARGEST_LOG_EXPONENT), jnp.float32)
+    limit = jnp.full(5, np.arctanh(np.log(0.6)), jnp.float32)
     camera = a2tg.Camera(jnp.eye(4).at[2, 3].set(4.0), CAMERA.K, 16, 16)
 
     def total(shapes):

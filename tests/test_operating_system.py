@@ -17,7 +17,7 @@ from scenes_random import as_camera, as_gaussians, draw_scene
 
 import a2tg_jax
 from a2tg_jax import render_image
-from a2tg_jax.base import machine, operating_system
+from a2tg_jax.base import control_groups, machine, operating_system, threads as threads_module
 from a2tg_jax.host import signals
 from a2tg_jax.rasterize.kernels.native import composite as native, ffi
 
@@ -163,7 +163,8 @@ def without_encoding(path):
 
 def test_text_is_utf8_on_every_system():
     """Except what Linux, and what the package's metadata, say of themselves."""
-    modules = [path for path in (ROOT / "a2tg_jax").rglob("*.py") if path.stem not in ("machine", "source_commit")]
+    of_system = {"control_groups", "machine", "memory", "source_commit"}
+    modules = [path for path in (ROOT / "a2tg_jax").rglob("*.py") if path.stem not in of_system]
     assert len(modules) > 100 and not [line for path in modules for line in without_encoding(path)]
     assert list(without_encoding(ROOT / "a2tg_jax" / "base" / "machine.py"))
 
@@ -221,8 +222,8 @@ def test_quotas_of_control_groups(tmp_path, name):
     for path, text in {"proc/self/cgroup": groups, **{f"sys/fs/cgroup/{k}": v for k, v in files.items()}}.items():
         (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / path).write_text(text + "\n")
-    assert machine.cpu_quota(tmp_path) == expected
-    assert machine.cpu_quota(tmp_path / "nowhere") == math.inf
+    assert control_groups.cpu_quota(tmp_path) == expected
+    assert control_groups.cpu_quota(tmp_path / "nowhere") == math.inf
 
 
 @pytest.fixture
@@ -236,15 +237,15 @@ def threads(monkeypatch):
 @pytest.mark.parametrize(("quota", "expected"), [(0.2, 1), (1.5, 2), (3.0, 3), (99.0, 8), (math.inf, 8)])
 def test_the_default_is_what_the_process_may_use(monkeypatch, threads, quota, expected):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(8), raising=False)
-    monkeypatch.setattr(machine, "cpu_quota", lambda: quota)
-    assert machine.num_threads() == expected
+    monkeypatch.setattr(threads_module, "cpu_quota", lambda: quota)
+    assert threads_module.num_threads() == expected
 
 
 def test_a_set_number_precedes_the_environment(monkeypatch, threads):
     monkeypatch.setenv("A2TG_NUM_THREADS", "3")
     for given, expected in ((5, 5), (None, 3)):
         a2tg_jax.set_num_threads(given)
-        assert machine.num_threads() == expected
+        assert threads_module.num_threads() == expected
     for wrong in (0, -1, 1.5, True, "2"):
         with pytest.raises(ValueError, match=r"num_threads must be a positive integer or None; got"):
             a2tg_jax.set_num_threads(wrong)

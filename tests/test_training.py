@@ -42,7 +42,7 @@ from a2tg_jax import (
     synthetic_scene,
     view_image,
 )
-from a2tg_jax.core.table import Shape
+from a2tg_jax.core.table import Layout
 from a2tg_jax.training import loop
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.start import initial_model, padded
@@ -148,7 +148,7 @@ def test_shapes_of_earlier_runs_change_nothing(scene, tmp_path, request):
     textures = whole.model.textures
     session = Session()
     capacities = (*(len(bucket) + 2 for bucket in textures.buckets), 1)
-    session.shapes.add(Shape((*textures.bucket_sizes, (5, 5)), capacities))
+    session.layouts.add(Layout((*textures.bucket_sizes, (5, 5)), capacities))
     path = tmp_path / "checkpoint.npz"
     rooms = []
 

@@ -37,7 +37,7 @@ from a2tg_jax import (
     save_model,
     save_ply,
 )
-from a2tg_jax.core.table import Shape, bucket_capacity, resize
+from a2tg_jax.core.table import Layout, bucket_capacity, resize
 from a2tg_jax.densify.view_dependence import most_blocks
 from a2tg_jax.training.start import padded
 
@@ -257,11 +257,11 @@ def test_there_is_room_for_all_degrees_that_fit(base, highest, num_bytes):
     assert dict(zip(*room, strict=True)) == expected
     degrees = np.random.default_rng(highest).integers(base, highest + 1, NUM)
     sizes = sizes_of(degrees, base)
-    wide = Shape(room.sizes, (bucket_capacity(NUM),) * len(room.sizes))
+    wide = Layout(room.sizes, (bucket_capacity(NUM),) * len(room.sizes))
     table, _ = resize(empty, sizes, room=wide)
-    assert table.shape == wide
+    assert table.layout == wide
     np.testing.assert_array_equal(table.sizes, sizes)
-    table, _ = resize(table, sizes, room=Shape(room.sizes, (1,) * len(room.sizes)))
+    table, _ = resize(table, sizes, room=Layout(room.sizes, (1,) * len(room.sizes)))
     np.testing.assert_array_equal(table.sizes, sizes)
 
 

@@ -31,7 +31,7 @@ import numpy as np
 from jax import Array
 from jax.typing import DTypeLike
 
-from a2tg_jax.base.machine import num_threads as num_threads
+from a2tg_jax.base.threads import num_threads as num_threads
 from a2tg_jax.rasterize.kernels.native import llvm_code
 
 Handler = Callable[[list[np.ndarray], list[np.ndarray]], None]
