@@ -26,7 +26,7 @@ from a2tg_jax import (
     textures_from_arrays,
 )
 from a2tg_jax.appearance import StaticShading, gaussian_cutoff
-from a2tg_jax.core.geometry import homographies
+from a2tg_jax.core.geometry import homographies_of
 from a2tg_jax.rasterize.kernels.native import composite as native, ffi
 from a2tg_jax.rasterize.tiles import TileGrid, tile_lists, total_pairs
 from a2tg_jax.rasterize.views import render_traced
@@ -43,7 +43,7 @@ def test_lists_are_those_of_xla(monkeypatch, dtype):
     scene = draw_scene(4, num=300)
     gaussians = as_gaussians(scene, dtype)
     camera = as_camera(scene, dtype)
-    M, _ = homographies(gaussians, camera)
+    M, _ = homographies_of(gaussians, camera)
     # Equal depths, to see ties in order of the index.
     splats = M.at[:, 2, 2].set(jnp.round(M[:, 2, 2], 1)), gaussian_cutoff(gaussians.opacities), 0.2
     for tile_size in (8, 16):
