@@ -56,7 +56,7 @@ def test_training_calls_its_session_after_compiling(monkeypatch):
         dropped.append(double._cache_size())
 
     jitted_step().clear_cache()
-    fit(scene, Gaussians2dMcmc(stage1_iterations=2), progress=False, session=Session(tidy))
+    fit(scene, Gaussians2dMcmc(stage1_iterations=2), session=Session(tidy))
     assert dropped[:2] == [1, 0]
 
 
@@ -117,7 +117,7 @@ def test_a_ulimit_counts_what_is_reserved(tmp_path, monkeypatch, letter, used):
 SMALL_FIT = """
 import a2tg_jax as a2tg
 scene = a2tg.synthetic_scene(num_views=3, width=24, height=16, num_points=40)
-print(a2tg.fit(scene, a2tg.Gaussians2dMcmc(stage1_iterations=2), progress=False))
+print(a2tg.fit(scene, a2tg.Gaussians2dMcmc(stage1_iterations=2)))
 """
 
 

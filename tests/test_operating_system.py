@@ -180,7 +180,7 @@ def test_files_of_the_project_can_lie_on_every_system():
 
 @pytest.mark.parametrize("num", [1, 2])
 def test_a_noted_signal_ends_the_block_and_a_second_one_does_at_once(num):
-    with pytest.raises(KeyboardInterrupt), signals.stop_on_signals((signals.CTRL_C,)) as is_interrupted:
+    with pytest.raises(KeyboardInterrupt), a2tg_jax.stop_on_signals((signal.SIGINT,)) as is_interrupted:
         assert not is_interrupted()
         for _ in range(num):
             signal.raise_signal(signal.SIGINT)
@@ -229,8 +229,9 @@ def test_quotas_of_control_groups(tmp_path, name):
 @pytest.fixture
 def threads(monkeypatch):
     """Neither `set_num_threads` nor the environment has set a number of threads."""
-    monkeypatch.setattr(threads_module, "_chosen", None)
-    monkeypatch.delenv(threads_module.VARIABLE, raising=False)
+    monkeypatch.delenv("A2TG_NUM_THREADS", raising=False)
+    yield
+    a2tg_jax.set_num_threads(None)
 
 
 @pytest.mark.parametrize(("quota", "expected"), [(0.2, 1), (1.5, 2), (3.0, 3), (99.0, 8), (math.inf, 8)])
@@ -241,7 +242,7 @@ def test_the_default_is_what_the_process_may_use(monkeypatch, threads, quota, ex
 
 
 def test_a_set_number_precedes_the_environment(monkeypatch, threads):
-    monkeypatch.setenv(threads_module.VARIABLE, "3")
+    monkeypatch.setenv("A2TG_NUM_THREADS", "3")
     for given, expected in ((5, 5), (None, 3)):
         a2tg_jax.set_num_threads(given)
         assert threads_module.num_threads() == expected
@@ -249,7 +250,7 @@ def test_a_set_number_precedes_the_environment(monkeypatch, threads):
         with pytest.raises(ValueError, match=r"num_threads must be a positive integer or None; got"):
             a2tg_jax.set_num_threads(wrong)
     for wrong in ("0", "-1", "two"):
-        monkeypatch.setenv(threads_module.VARIABLE, wrong)
+        monkeypatch.setenv("A2TG_NUM_THREADS", wrong)
         with pytest.raises(ValueError, match=rf"A2TG_NUM_THREADS must be a positive integer; got '{wrong}'"):
             a2tg_jax.configure_cpu(use_cache=False)
 
