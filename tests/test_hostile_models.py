@@ -34,11 +34,9 @@ from a2tg_jax import (
 )
 from a2tg_jax.base.json_text import parse_json
 from a2tg_jax.base.npz import read_npz
-from a2tg_jax.core.table import check_places
 from a2tg_jax.io import ply
 from a2tg_jax.model import check_model
 from a2tg_jax.rasterize.views import render_traced
-from a2tg_jax.texture import check_textures
 from a2tg_jax.training.registry import system_from_dict
 
 
@@ -133,7 +131,7 @@ def test_models_that_no_camera_sees(tmp_path, change, message):
     [
         (with_number("appearance/shapes", np.nan), "must be finite"),
         (with_number("appearance/shapes", 1e30), "must be within"),
-        (with_array("appearance/shapes", lambda x: x[1:]), r"shapes must be \[12\], one for each Gaussian"),
+        (with_array("appearance/shapes", lambda x: x[1:]), r"shapes must be \[12\]; got \[11\]"),
         (with_array("appearance/shapes", lambda x: x[:, None]), r"shapes must be floats \[N\]"),
         (with_array("appearance/shapes", lambda x: x.astype(int)), r"shapes must be floats \[N\]"),
         (lambda _, arrays: arrays.pop("appearance/shapes"), "the array shapes of the appearance is missing"),
@@ -161,7 +159,10 @@ def test_textures_lie_within_their_buckets_and_apart():
         buckets = jnp.zeros((4, 1, 1, 4)), jnp.zeros((2, 2, 1, 4))
         return Textures(buckets, jnp.asarray(bucket, jnp.int32), jnp.asarray(row, jnp.int32), ((1, 1), (2, 1)))
 
-    check_places(placed([0, 0, 1], [0, 3, 1]))
+    def checked(textures):
+        check_model(Model(some_gaussians()[:3], a2tg.Appearance(texture=a2tg.Texture(textures))))
+
+    checked(placed([0, 0, 1], [0, 3, 1]))
     for bucket, row, message in [
         ([0, 0, 1], [0, 4, 1], "textures.row must be below the number"),
         ([0, 0, 1], [0, -1, 1], "textures.row must be below the number"),
@@ -170,10 +171,7 @@ def test_textures_lie_within_their_buckets_and_apart():
         ([0, 0, 1], [2, 2, 0], "some share one"),
     ]:
         with pytest.raises(ValueError, match=message):
-            check_textures(placed(bucket, row))
-            check_places(placed(bucket, row))
-        with pytest.raises(ValueError, match=message):
-            check_model(Model(some_gaussians()[:3], a2tg.Appearance(texture=a2tg.Texture(placed(bucket, row)))))
+            checked(placed(bucket, row))
 
 
 # Numbers at the limit, and files that are none

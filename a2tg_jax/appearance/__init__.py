@@ -1,4 +1,6 @@
-"""What splats show: `base` is the interface, `parts` are its optional parts: texture, exponents, bands.
+"""Appearance of splats: `base` is the interface, `parts` are its optional parts: texture, exponents, bands.
+
+`shapes` are always shapes of kernels, numbers from which their exponents follow; arrays have sizes.
 
 `movable_kernels` and `billboards` are other appearances. Compositors trace `elementwise`; `files` names the arrays in
 files.
@@ -7,12 +9,9 @@ files.
 from a2tg_jax.appearance.base import (
     Appearance as Appearance,
     allocate_appearance as allocate_appearance,
-    appearance_for as appearance_for,
     count_floats as count_floats,
     gaussian_cutoff as gaussian_cutoff,
-    in_words as in_words,
     project_appearance as project_appearance,
-    template_of as template_of,
 )
 from a2tg_jax.appearance.billboards import Billboards as Billboards
 from a2tg_jax.appearance.elementwise import (
