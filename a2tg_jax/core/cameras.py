@@ -221,7 +221,7 @@ def back_project(depth: Array, camera: Camera) -> Array:
       camera: the view, of that size.
 
     Returns:
-      Points [H, W, 3]; those of pixels without a ray have no meaning.
+      Points [H, W, 3]. Pixels without a ray give points without meaning.
     """
     height, width = depth.shape
     x, y = jnp.meshgrid(jnp.arange(width, dtype=depth.dtype) + 0.5, jnp.arange(height, dtype=depth.dtype) + 0.5)
