@@ -203,31 +203,30 @@ def _read(files: _Files, options: SceneOptions, shelf: Shelf) -> tuple[Shot, Pat
     height, width = photograph.shape[:2]
     stored = (width, height)
     lens = _lens_of(files, stored, options.downscale)
-    mask = None if files.mask is None else read_mask(files.mask, stored, lens.size)
     try:
         size, K = lens.view_of(stored, files.downscale)
         rays = lens.rays(*size)
     except ValueError as error:
         raise ValueError(f"{photo.what}: its camera model {error}") from None
+    mask = None if files.mask is None else read_mask(files.mask, stored, lens.size)
     pixels = photograph
-    counts = None
     if mask is not None and options.mask_as == "background":
-        pixels = _cut_out(pixels, mask.counts)
-    elif mask is not None:
-        counts = _view_mask(mask.counts, files.mask_downscale, lens, size)
+        pixels = _cut_out(photograph, mask.counts)
     pixels = lens.view_pixels(pixels, files.downscale)
+    counted = []
+    if mask is not None and options.mask_as == "ignored":
+        counted.append(_view_mask(mask.counts, files.mask_downscale, lens, size))
     if mask is None and photo.counted is not None:
-        counts = photo.counted(pixels)
+        counted.append(photo.counted(pixels))
     if options.alpha == "mask" and pixels.shape[2] == 4:
-        is_opaque = pixels[..., 3] == 255
-        counts = is_opaque if counts is None else is_opaque & counts
+        counted.append(pixels[..., 3] == 255)
         pixels = np.ascontiguousarray(pixels[..., :3])  # A view would keep the alpha channel in memory.
     shot = Shot(
         photo.name,
         photo.viewmat,
         K,
         shelf.keep(pixels, files.image if pixels is photograph else None),
-        None if counts is None else Mask.of(counts),
+        Mask.of(np.logical_and.reduce(counted)) if counted else None,
         rays,
         None if files.depths is None else _depth_map(files.depths, lens, stored, size),
         photo.panorama,

@@ -269,7 +269,7 @@ def _splats(document: Document, attributes: Mapping[str, object]) -> Ellipsoids:
 
 def _shown(document: Document, described: Mapping[str, Any], splats: Ellipsoids) -> tuple[Appearance, Rows, int]:
     """Return the template, the tables and the common degree of splats, from the extension's object. ValueError: a field
-    is missing, out of range, or contradicts the"""
+    is missing, out of range, or contradicts the splats."""
     num, highest = splats.sh.shape[:2]
     base_degree = sh_degree = NUM_BASES.index(highest)
     has_textures, has_degrees, has_shapes = (name in described for name in ("sizes", "degrees", "shapes"))
