@@ -390,7 +390,7 @@ def resize(
 
 
 def _rebuilt(old: TableT, sources: _Indices, ids: np.ndarray, places: Places, padding: Sequence[float]) -> TableT:
-    """Return a table with the blocks of the old one that are at (bucket, row) [n], resized, as those of the Gaussians
+    """Return a table with the blocks of the old one that are at (bucket, row) [n], resized, as blocks of the Gaussians
     `ids` [n]; other Gaussians have padding."""
     buckets = _filled(places.layout, padding, old._dtype)
     old_bucket, old_row = sources
