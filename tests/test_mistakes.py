@@ -679,7 +679,7 @@ def test_a_redefined_class_is_another_one():
         return Redefined
 
     with pytest.raises(ValueError, match=r"before it was defined again\): resume with checkpoint.system, or"):
-        check_resume(Checkpoint(defined()(), 0, None, History.empty()), defined()(), 0)
+        check_resume(Checkpoint(defined()(), 0, None, History.empty()), defined()())
 
 
 def test_a_capacity_that_is_too_small_warns_eagerly():

@@ -32,7 +32,7 @@ from a2tg_jax.results.stage_training import check_finished, train_stage
 from a2tg_jax.training.loop import IsStopped, Watch, never, unwatched
 from a2tg_jax.training.registry import system_to_dict
 from a2tg_jax.training.reports import Progress
-from a2tg_jax.training.start import check_loss_data, check_start
+from a2tg_jax.training.start import check_points
 
 LESS_MEMORY = (
     "close other programs, or start another run with a larger `downscale`, or a smaller `memory_budget` or `batch_size`"
@@ -96,9 +96,10 @@ def begin_run(record: RunRecord, out: Path, options: RunOptions) -> RunResult:
     check_output(out)
     scene = record.scene.load(room_for_photographs(options.max_memory))
     for system in record.systems.values():
-        check_loss_data(scene.train, system.all_stages())
+        for stage in system.all_stages():
+            stage.check_views(scene.train)
         if given is None or system is not record.options:
-            check_start(scene, system)
+            check_points(scene, system)
     doubts = doubts_about(scene, record)
     if doubts:
         options.confirm(doubts)

@@ -171,7 +171,7 @@ class System(NamedFields):
     @property
     def initial_bytes(self) -> float:
         """Bytes of a Gaussian that training starts from, with its appearance in the first stage."""
-        return bytes_per_gaussian(self.initial_sh_degree, self.stages()[0].floats_shown(self.initial_sh_degree))
+        return bytes_per_gaussian(self.initial_sh_degree, self.stages()[0].floats_shown)
 
     @property
     def budget_bytes(self) -> int | None:
@@ -377,7 +377,7 @@ class System(NamedFields):
             return ("memory_budget",)
         return self.caps() or ("initial_gaussians",)
 
-    def check_number(self, num: int) -> None:
+    def check_initial_number(self, num: int) -> None:
         """Check the options for a number of Gaussians at the start.
 
         Raises:
@@ -391,12 +391,11 @@ class System(NamedFields):
         Raises:
           ValueError: naming the option.
         """
-        self.check_number(num)
+        self.check_initial_number(num)
         if self.budget_bytes is None:
             return
-        degree = self.initial_sh_degree
         for stage in self.stages():
-            size = bytes_per_gaussian(degree, stage.floats_shown(degree))
+            size = bytes_per_gaussian(self.initial_sh_degree, stage.floats_shown)
             left = self.budget_bytes - stage.shared_bytes
             if num * size > left:
                 raise ValueError(
