@@ -182,7 +182,7 @@ class Event(NamedFields):
         """
         if self.statistic is None:
             return ()
-        return GradientStatistics.init(model.gaussians.num, model.gaussians.means.dtype)
+        return GradientStatistics.init(model.num_rows, model.gaussians.means.dtype)
 
     def gather(self, state: Any, rows: np.ndarray) -> Any:
         """Return the state whose row i is the former row rows[i] (host). ValueError: by default, if an array that is no
@@ -285,7 +285,7 @@ def keep_rows(model: Model, moments: AdamState, state: object, is_kept: Array | 
         sizes.
     """
     num = model.num
-    rows = np.arange(model.gaussians.num, dtype=np.int32)
+    rows = np.arange(model.num_rows, dtype=np.int32)
     is_kept = np.asarray(is_kept)
     check_mask("is_kept", is_kept, (len(rows) if is_kept.shape == rows.shape else num,))
     is_kept = is_kept[:num]

@@ -76,7 +76,7 @@ class PlaceByError(HostEvent):
             raise ValueError("share must be 0 in a stage whose Gaussians have textures or differ in degree")
         num = model.num
         num_added = round(num * float(self.share))
-        room = min(self.cap, model.gaussians.num) - num
+        room = min(self.cap, model.num_rows) - num
         if not num_added:
             return Change(model, moments, state, unused=f"share of {num:,} Gaussians is less than one: raise it")
         if room <= 0:
@@ -98,7 +98,7 @@ class PlaceByError(HostEvent):
 
         present = model.gaussians, model.appearance
         gaussians, appearance = map_rows(replaced, replaced, present, (added, appearance))
-        is_new = np.isin(np.arange(model.gaussians.num), rows)
+        is_new = np.isin(np.arange(model.num_rows), rows)
         moments = jax.jit(clear_moments)(model, moments, is_new)
         num_live = jax.device_put(np.asarray(num + added.num, np.int32))
         model = dataclasses.replace(model, gaussians=gaussians, appearance=appearance, num_live=num_live)

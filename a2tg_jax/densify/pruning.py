@@ -109,8 +109,8 @@ def shown_in(model: Model, views: Sequence[View], least: float = 1.0) -> Contrib
     """
     if not views:
         raise ValueError("views must hold at least one view; got none")
-    total = np.zeros(model.gaussians.num)
-    num_views = np.zeros(model.gaussians.num, np.int64)
+    total = np.zeros(model.num_rows)
+    num_views = np.zeros(model.num_rows, np.int64)
     if not len(total):
         return Contributions(total, num_views)
     dtype = model.gaussians.means.dtype

@@ -213,7 +213,7 @@ def _rest(state: TrainState) -> tuple[object, ...]:
 def _packed(model: Model, moments: AdamState) -> AdamState:
     """Return moments at the capacity that tables get when they are loaded, which may be less than in training."""
     _, rest = partition(model.appearance)
-    rows = np.arange(model.gaussians.num)
+    rows = np.arange(model.num_rows)
 
     def packed(moment: Model) -> Model:
         whole = map_rows(
@@ -283,7 +283,7 @@ def state_of_checkpoint(
     check_corrections(resume.state.corrections, len(views))
     if resume.views is not None:
         resume.views.check(views)
-    num = resume.state.model.gaussians.num
+    num = resume.state.model.num_rows
     if num % num_devices:
         warnings.warn(
             f"the checkpoint has {num:,} rows, which {num_devices} devices cannot share evenly: each holds all of them "

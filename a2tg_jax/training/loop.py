@@ -299,7 +299,7 @@ class StageRun:
                     on_checkpoint(self.checkpoint)
                 if must_stop:
                     raise Interrupted(self.checkpoint)
-        self.effects.warn_at_end(self.num_refused, self.state.model.gaussians.num)
+        self.effects.warn_at_end(self.num_refused, self.state.model.num_rows)
 
     def _log(self, iteration: int, info: StepInfo, on_log: OnLog | None) -> None:
         """Add a row to the history."""
@@ -379,13 +379,13 @@ class StageRun:
             sample = evenly_chosen(views, PLANNED_VIEWS)
             cameras = [jax.tree.map(lambda x: jnp.asarray(x, dtype), view.camera) for view in sample]
             pairs = most_pairs(model.gaussians, cameras, appearance, settings, model.num_live)
-            growth = (model.gaussians.num / max(model.num, 1)) ** 0.5
+            growth = (model.num_rows / max(model.num, 1)) ** 0.5
             self.capacities[size] = self.session.room.plan(self._place(size), pairs * GROWTH_ROOM * growth)
         return dataclasses.replace(settings, capacity=self.capacities[size])
 
     def _place(self, size: Size) -> tuple[object, ...]:
         """Return the key of a capacity of the session: stages that show the same share it."""
-        return self.stage.appearance, self.state.model.gaussians.num, *size
+        return self.stage.appearance, self.state.model.num_rows, *size
 
     def _after_failure(self, iteration: int, info: StepInfo) -> None:
         """Make more room if the tile lists of a step overflowed; raise an error for every other cause."""

@@ -339,7 +339,7 @@ def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> 
     """
     gaussians = model.gaussians
     shapes = model.appearance.shapes
-    num = model.gaussians.num
+    num = model.num_rows
     for event in stage.events:
         most = event.most_gaussians
         if most is not None and num > most:
