@@ -17,10 +17,10 @@ from .appearance import (
     allocate_appearance as allocate_appearance,
     project_appearance as project_appearance,
 )
+from .base.checks import check_number as check_number
 from .base.machine import set_num_threads as set_num_threads
 from .core.bilinear import TextureRegion as TextureRegion
-from .core.camera_paths import look_at as look_at, path_through as path_through, smooth_path as smooth_path
-from .core.cameras import Camera as Camera, resize_camera as resize_camera
+from .core.cameras import Camera as Camera, back_project as back_project, resize_camera as resize_camera
 from .core.gaussians import Gaussians as Gaussians, init_from_points as init_from_points
 from .core.optim import (
     AdamState as AdamState,
@@ -40,6 +40,12 @@ from .core.pytree import (
 from .core.similarity import Similarity as Similarity, transform_gaussians as transform_gaussians
 from .data.arrays import scene_from_arrays as scene_from_arrays
 from .data.assembly import with_validation_views as with_validation_views
+from .data.camera_paths import (
+    look_at as look_at,
+    path_through as path_through,
+    smooth_path as smooth_path,
+    turntable as turntable,
+)
 from .data.load import load_scene as load_scene
 from .data.sfm import SfmSummary as SfmSummary, run_sfm as run_sfm
 from .data.synthetic import cells_scene as cells_scene, synthetic_scene as synthetic_scene

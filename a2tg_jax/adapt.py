@@ -12,8 +12,9 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from a2tg_jax.appearance import in_words
-from a2tg_jax.core.budget import MOST_ROOM, bytes_of, event_budget, within_budget
-from a2tg_jax.core.checks import check_int, check_literal, check_number, check_shape
+from a2tg_jax.base.checks import check_int, check_literal, check_number, check_shape
+from a2tg_jax.base.text import bytes_of
+from a2tg_jax.core.budget import MOST_ROOM, event_budget, within_budget
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.table import Shape, bucket_capacity, resize

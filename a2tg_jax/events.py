@@ -17,10 +17,10 @@ from jax import Array
 from jax.typing import DTypeLike
 
 from a2tg_jax.appearance.base import clear_rows
+from a2tg_jax.base.checks import check_floats, check_mask, check_shape
+from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.text import shortened
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.checks import check_floats, check_mask, check_shape
-from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.numerics import safe_divide, safe_norm
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.origin import BLACK, Color

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from a2tg_jax.base.checks import check_int, check_number, check_shape
 from a2tg_jax.core.budget import number_to_reach
-from a2tg_jax.core.checks import check_int, check_number, check_shape
 from a2tg_jax.core.gaussians import DEAD_OPACITY, MAX_SHARES, Gaussians, check_gaussians, rotation_matrices, share
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree, static

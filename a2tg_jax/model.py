@@ -21,10 +21,7 @@ from a2tg_jax.appearance.parts import (
     dense_bands,
     nearest_gaussians,
 )
-from a2tg_jax.base.text import counted, in_bytes
-from a2tg_jax.core.budget import BYTES_PER_FLOAT
-from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.checks import (
+from a2tg_jax.base.checks import (
     LARGEST_NUMBER,
     check_bounded,
     check_count,
@@ -33,8 +30,11 @@ from a2tg_jax.core.checks import (
     check_unmasked,
     short_repr,
 )
+from a2tg_jax.base.named_fields import NamedFields
+from a2tg_jax.base.text import counted, in_bytes
+from a2tg_jax.core.budget import BYTES_PER_FLOAT
+from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import LARGEST_LOG_SCALE, LARGEST_OPACITY, Gaussians, check_gaussians, logit
-from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.notebook_display import html_table
 from a2tg_jax.core.origin import BLACK, Color, Origin, check_origin
 from a2tg_jax.core.pytree import beside, pytree, static

@@ -20,11 +20,11 @@ from a2tg_jax.appearance import Appearance, Bands, Exponents, Texture, TextureOp
 from a2tg_jax.appearance.base import PARTS, template_of
 from a2tg_jax.appearance.files import arrays_of, with_arrays
 from a2tg_jax.base.archive import arrays_below, read_archive, write_archive
+from a2tg_jax.base.checks import check_shape
+from a2tg_jax.base.config_json import config_from_dict, config_to_dict
 from a2tg_jax.base.regular_files import reading
 from a2tg_jax.base.suffixes import check_suffix
 from a2tg_jax.base.text import shortened
-from a2tg_jax.core.checks import check_shape
-from a2tg_jax.core.config_json import config_from_dict, config_to_dict
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.origin import BLACK, Color, Origin
 from a2tg_jax.core.similarity import Similarity

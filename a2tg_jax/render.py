@@ -20,8 +20,8 @@ from numpy.typing import ArrayLike
 
 from a2tg_jax.appearance import Appearance, appearance_for, check_is_appearance
 from a2tg_jax.appearance.base import num_colors_of
+from a2tg_jax.base.checks import check_floats, check_kind, check_shape, check_unmasked, dtype_of, plain_array
 from a2tg_jax.core.cameras import Camera, check_camera
-from a2tg_jax.core.checks import check_floats, check_kind, check_shape, check_unmasked, dtype_of, plain_array
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
 from a2tg_jax.rasterize.room import has_rows, warn_of_empty, with_capacity

@@ -8,9 +8,9 @@ from numpy.typing import ArrayLike
 
 from a2tg_jax.appearance import Appearance, check_is_appearance
 from a2tg_jax.appearance.base import num_colors_of
+from a2tg_jax.base.checks import check_kind, check_number
 from a2tg_jax.base.text import counted
 from a2tg_jax.core.cameras import Camera, check_camera, checked_cameras, resize_camera
-from a2tg_jax.core.checks import check_kind, check_number
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.model import Model

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike, DTypeLike
 
-from a2tg_jax.core.checks import check_number, check_unmasked, plain_array
+from a2tg_jax.base.checks import check_number, check_unmasked, plain_array
 from a2tg_jax.core.pytree import pytree
 from a2tg_jax.core.table import Size, Table, check_table
 

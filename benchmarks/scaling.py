@@ -20,7 +20,7 @@ import jax
 import numpy as np
 
 import a2tg_jax as a2tg
-from a2tg_jax.core.config_json import changed_config
+from a2tg_jax.base.config_json import changed_config
 from a2tg_jax.systems.baselines import Gaussians2d
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.start import initial_model

@@ -26,7 +26,7 @@ MAIN = {
     "Textures", "textures_from_arrays", "Upscale", "value_and_grad", "view_gradients", "view_image",
 }  # fmt: skip
 """Names with an example."""
-ALSO_PUBLIC = {"check_number", "Table"}
+ALSO_PUBLIC = {"Table"}
 """Names that the reference gives to custom systems besides."""
 PUBLIC = {name: getattr(a2tg, name) for name in a2tg.__all__}
 FUNCTIONS = {name: value for name, value in PUBLIC.items() if inspect.isfunction(value)}

@@ -27,9 +27,9 @@ from a2tg_jax import (
     init_from_points,
     partition,
 )
+from a2tg_jax.base.config_json import config_from_dict, config_to_dict
 from a2tg_jax.cli import main as cli
 from a2tg_jax.core.budget import bytes_per_gaussian, number_to_reach
-from a2tg_jax.core.config_json import config_from_dict, config_to_dict
 from a2tg_jax.training import SYSTEMS
 from a2tg_jax.training.fitting import warn_of_budget
 from a2tg_jax.training.registry import system_from_dict, system_to_dict

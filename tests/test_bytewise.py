@@ -27,7 +27,8 @@ from a2tg_jax import (
     load_checkpoint,
     save_checkpoint,
 )
-from a2tg_jax.core.budget import bytes_of, event_budget
+from a2tg_jax.base.text import bytes_of
+from a2tg_jax.core.budget import event_budget
 from a2tg_jax.results.record import compared_system
 from a2tg_jax.training.start import initial_model, padded
 from a2tg_jax.training.step import jitted_step

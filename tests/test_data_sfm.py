@@ -13,7 +13,7 @@ from PIL import ExifTags, Image
 from test_data_colmap import dot_place, write_scene as write_colmap
 
 from a2tg_jax import load_scene, look_at, run_sfm
-from a2tg_jax.core.camera_paths import vertical_of
+from a2tg_jax.core.origin import vertical_of
 from a2tg_jax.data import sfm, synthetic
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.decoding import picture_facts, picture_size, read_pixels

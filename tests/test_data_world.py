@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 from small_values import centers_of
 
 import a2tg_jax as a2tg
-from a2tg_jax import Similarity, load_scene
-from a2tg_jax.core.camera_paths import outlying_cameras, turntable
+from a2tg_jax import Similarity, load_scene, turntable
 from a2tg_jax.data.assembly import normalizing_similarity
+from a2tg_jax.data.capture_geometry import outlying_cameras
 from a2tg_jax.mesh.extract import common_sphere
 
 

@@ -13,12 +13,11 @@ from test_upright import captured, node_matrix
 from viewer_cases import small_model
 
 import a2tg_jax as a2tg
-from a2tg_jax import Similarity
+from a2tg_jax import Similarity, turntable
 from a2tg_jax.cli.main import main
-from a2tg_jax.core.camera_paths import turntable
-from a2tg_jax.core.floaters import floater_scores
 from a2tg_jax.io.columns import decode
 from a2tg_jax.io.edit_file import largest_score, scores_of
+from a2tg_jax.io.floaters import floater_scores
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.results.editing import EditOptions
 

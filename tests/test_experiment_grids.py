@@ -26,7 +26,7 @@ from test_data_transforms import write_blender
 
 import a2tg_jax as a2tg
 from a2tg_jax import Term
-from a2tg_jax.core.config_json import flatten_config
+from a2tg_jax.base.config_json import flatten_config
 
 LARGE_SCALES = ("full", "full_size", "half_size", "long", "paper160")
 NEED_CHOICES = (("bytewise", "protocol"), ("claims", "claims"), ("confirmation", "claims"))

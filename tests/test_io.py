@@ -29,7 +29,7 @@ from a2tg_jax import (
     transform_gaussians,
 )
 from a2tg_jax.base.archive import read_archive, read_archive_header, write_archive
-from a2tg_jax.core.config_json import config_from_dict, config_to_dict, flatten_config
+from a2tg_jax.base.config_json import config_from_dict, config_to_dict, flatten_config
 from a2tg_jax.io.ply import encode_ply
 
 

@@ -8,7 +8,7 @@ from toy_system import Shrink, Toy
 
 import a2tg_jax as a2tg
 from a2tg_jax import HostEvent, StepEvent, find_system
-from a2tg_jax.core.config_json import flatten_config
+from a2tg_jax.base.config_json import flatten_config
 from a2tg_jax.training import SYSTEMS
 
 WITH_AND_WITHOUT = pytest.mark.parametrize("budget", [None, "9MB"])

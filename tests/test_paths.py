@@ -7,8 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from small_values import centers_of
 
-from a2tg_jax import Camera, look_at, path_through
-from a2tg_jax.core.camera_paths import central_camera, turntable, vertical_of
+from a2tg_jax import Camera, look_at, path_through, turntable
+from a2tg_jax.core.origin import vertical_of
+from a2tg_jax.data.capture_geometry import central_camera
 from a2tg_jax.io.path_file import load_views
 
 

@@ -11,8 +11,8 @@ from scenes_random import as_camera, as_gaussians, draw_scene
 
 import a2tg_jax as a2tg
 from a2tg_jax import Camera, Gaussians, View, resize_camera
-from a2tg_jax.core.cameras import crop_camera
 from a2tg_jax.render import jitted_render
+from a2tg_jax.results.frames import crop_camera
 
 
 def cloud(num: int = 300) -> Gaussians:

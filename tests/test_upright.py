@@ -12,7 +12,8 @@ from small_values import assert_same, some_gaussians, some_world
 import a2tg_jax as a2tg
 from a2tg_jax import Camera, Origin, Similarity
 from a2tg_jax.cli.main import main
-from a2tg_jax.core.camera_paths import upright_rotation, vertical_of
+from a2tg_jax.core.origin import vertical_of
+from a2tg_jax.data.capture_geometry import upright_rotation
 
 UP_AXES = [sign * axis for axis in np.eye(3) for sign in (1, -1)]
 FILE_UP = np.array([0.0, -1.0, 0.0])

@@ -35,12 +35,12 @@ from a2tg_jax.appearance.parts import (
     curves_of,
     reach_of,
 )
+from a2tg_jax.base.checks import FLOATS, check_kind, check_shape, described
+from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.checks import FLOATS, check_kind, check_shape, described
 from a2tg_jax.core.gaussians import Gaussians, logit, share
 from a2tg_jax.core.geometry import homographies
-from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.numerics import Integer, at_least
 from a2tg_jax.core.pytree import is_shared, partition, pytree, static
 from a2tg_jax.core.sh import sh_sum

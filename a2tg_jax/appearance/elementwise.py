@@ -16,8 +16,8 @@ from jax import Array
 
 from a2tg_jax.appearance.base import Appearance, check_arrays_given, without_arrays
 from a2tg_jax.appearance.parts import Curve, Factor, Residual, Tint, falloff_of
+from a2tg_jax.base.checks import check_kind, described
 from a2tg_jax.core.bilinear import TextureRegion
-from a2tg_jax.core.checks import check_kind, described
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.pytree import check_pytree
 from a2tg_jax.core.table import check_table, is_table

@@ -15,10 +15,10 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike, DTypeLike
 
+from a2tg_jax.base.checks import check_literals, check_number
+from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.core.bilinear import TextureRegion
-from a2tg_jax.core.checks import check_literals, check_number
 from a2tg_jax.core.gaussians import LARGEST_OPACITY, Gaussians, logit
-from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.numerics import Integer, within
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.sh import NUM_BASES, directions_from, sh_basis

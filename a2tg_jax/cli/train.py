@@ -16,14 +16,13 @@ import tyro
 from tyro.conf import Fixed, Positional, Suppress, UseAppendAction, arg
 
 from a2tg_jax import A2tg, Mcmc, Scene, Session, Upscale
+from a2tg_jax.base.config_json import flatten_config
 from a2tg_jax.base.machine import tidy_memory
 from a2tg_jax.base.operating_system import has_display
 from a2tg_jax.base.regular_files import expanded
-from a2tg_jax.base.text import counted
+from a2tg_jax.base.text import budget_in_bytes, counted
 from a2tg_jax.cli.arguments import FLAGS, LpipsWeights, defaulting_to, print_now
 from a2tg_jax.cli.processes import AUTO, ProcessPlace, joined
-from a2tg_jax.core.budget import budget_in_bytes
-from a2tg_jax.core.config_json import flatten_config
 from a2tg_jax.data.load import SceneSource
 from a2tg_jax.results.commands import file_command, resuming_command
 from a2tg_jax.results.folder import RunFolder, open_run, opened

@@ -1,63 +1,18 @@
-"""Memory budgets: parsing, the number of Gaussians that fit, and the choice of where to spend bytes."""
-
-import decimal
-import math
-import re
+"""Memory budgets: the number of Gaussians that fit, and the choice of where to spend bytes."""
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.base.text import shortened
 from a2tg_jax.core.gaussians import floats_per_gaussian
 from a2tg_jax.core.numerics import Integer
 
 BYTES_PER_FLOAT = 4
-MEGABYTE = 10**6
-# As text, for Decimal.
-MEGABYTES = {
-    "": "1", "kb": "1e-3", "mb": "1", "gb": "1e3", "kib": "0.001024", "mib": "1.048576", "gib": "1073.741824",
-}  # fmt: skip
-"""Megabytes of each unit; a number without a unit is in megabytes."""
 MOST_ROOM = 0.5
 """Largest share of a budget that tables of degrees or textures, padding included, may take when they are allocated
 before a stage, so that they can fill without another compilation."""
 LARGEST_SHORTFALL = 0.005
 """Largest unused fraction of a budget without a warning."""
-
-
-def megabytes_of(budget: float | str | None, name: str = "memory_budget") -> float | None:
-    """Return a budget in MB (10^6 bytes), from "1.5MB", "800 kB", "2GB" or a number of MB; None stays None.
-
-    Raises:
-      ValueError: if it is none of these, or not positive.
-    """
-    if budget is None or budget == "None":
-        return None
-    match = re.fullmatch(r"\s*([0-9.]+(?:e[+-]?[0-9]+)?)\s*([a-z]*)\s*", str(budget).lower())
-    try:
-        number, unit = match.groups() if match else ("", "")
-        # As floats, 33.3 kB would be 0.033299999999999996 MB, in messages as well.
-        megabytes = float(decimal.Decimal(number) * decimal.Decimal(MEGABYTES[unit]))
-    except (KeyError, decimal.InvalidOperation):
-        raise ValueError(
-            f"{name} must be a number of MB (10^6 bytes), or one with a unit, such as 1.5MB, 800kB or 2GB; "
-            f"got {shortened(budget)}"
-        ) from None
-    if not 0 < megabytes < math.inf:
-        raise ValueError(f"{name} must be positive and finite; got {shortened(budget)}")
-    return megabytes
-
-
-def bytes_of(megabytes: float) -> int:
-    """Return the whole bytes of a budget in MB."""
-    return round(megabytes * MEGABYTE)
-
-
-def budget_in_bytes(budget: float | str | None, name: str) -> int | None:
-    """Return the whole bytes of a budget; None stays None. Raises as `megabytes_of`."""
-    megabytes = megabytes_of(budget, name)
-    return None if megabytes is None else bytes_of(megabytes)
 
 
 def bytes_per_gaussian(sh_degree: int, floats: float = 0) -> float:

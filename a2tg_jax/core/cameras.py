@@ -1,6 +1,5 @@
 """Pinhole cameras in OpenCV's frame: x right, y down, z forward; pixel centres at +0.5."""
 
-import dataclasses
 from collections.abc import Iterable
 from typing import Any
 
@@ -9,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.core.checks import (
+from a2tg_jax.base.checks import (
     LARGEST_NUMBER,
     check_array,
     check_floats,
@@ -18,7 +17,7 @@ from a2tg_jax.core.checks import (
     make_plain,
     short_repr,
 )
-from a2tg_jax.core.named_fields import NamedFields
+from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.core.pytree import pytree, static
 
 LONGEST_SIDE = 100_000
@@ -213,22 +212,16 @@ def _resampled(values: Array, num: int, axis: int) -> Array:
     return low + share * (high - low)
 
 
-def crop_camera(camera: Camera, width: int, height: int) -> Camera:
-    """Return the view of a pinhole camera at another image size and aspect: scaled to cover it, and cropped around its
-    centre. Rays of a lens are left out."""
-    check_is_camera(camera)
-    check_int("width", width, 1)
-    check_int("height", height, 1)
-    camera = dataclasses.replace(camera, rays=None)
-    factor = max(width / camera.width, height / camera.height)
-    scaled = resize_camera(camera, round(factor * camera.width), round(factor * camera.height))
-    shift = jnp.asarray([(width - scaled.width) / 2, (height - scaled.height) / 2], camera.K.dtype)
-    return Camera(camera.viewmat, scaled.K.at[:2, 2].add(shift), width, height)
-
-
 def back_project(depth: Array, camera: Camera) -> Array:
-    """Return the world points [H, W, 3] of the pixels at depths [H, W] along the camera's z axis; pixels
-    without a ray give points without meaning."""
+    """Return the points of the world that pixels show at given depths; differentiable.
+
+    Args:
+      depth: [H, W] depths along the camera's z axis, such as `RenderOutput.depth`.
+      camera: the view, of that size.
+
+    Returns:
+      Points [H, W, 3]; those of pixels without a ray have no meaning.
+    """
     height, width = depth.shape
     x, y = jnp.meshgrid(jnp.arange(width, dtype=depth.dtype) + 0.5, jnp.arange(height, dtype=depth.dtype) + 0.5)
     if camera.rays is not None:
@@ -237,36 +230,6 @@ def back_project(depth: Array, camera: Camera) -> Array:
     rotation = camera.viewmat[:3, :3]
     # Rays are rows: r·Rc is Rcᵀ·r, transposed.
     return (rays @ rotation) * depth[..., None] + camera.center[None, None]
-
-
-def intrinsics(width: int, height: int, field_of_view: float) -> np.ndarray:
-    """Return K [3, 3] of square pixels with the principal point in the middle. The field of view is in radians, across
-    the longer side."""
-    focal = max(width, height) / (2 * np.tan(field_of_view / 2))
-    return np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
-
-
-def looking(center: np.ndarray, forward: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """Return the world-to-camera matrix [4, 4] at `center`, with z along `forward` and y closest to `down`."""
-    z = forward / np.linalg.norm(forward)
-    # A right-handed frame: x = y × z, y = z × x.
-    x = np.cross(down, z)
-    x /= np.linalg.norm(x)
-    return viewmat_of_axes(np.stack([x, np.cross(z, x), z]), center)
-
-
-def viewmat_of_axes(rotation: np.ndarray, center: np.ndarray) -> np.ndarray:
-    """Return the world-to-camera matrix [4, 4] of a camera's axes, as rows, and its position."""
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = rotation
-    viewmat[:3, 3] = -rotation @ center
-    return viewmat
-
-
-def camera_centers(viewmats: np.ndarray) -> np.ndarray:
-    """Return the positions [V, 3] of cameras given as rigid world-to-camera matrices [V, 4, 4]: c = -Rcᵀ·t."""
-    centers: np.ndarray = np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3])
-    return -centers
 
 
 def pinhole_pixels(points: np.ndarray, K: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from jax import Array
 from jax.typing import ArrayLike, DTypeLike
 from scipy.spatial import cKDTree
 
-from a2tg_jax.core.checks import (
+from a2tg_jax.base.checks import (
     FLOATS,
     LARGEST_NUMBER,
     check_array,
@@ -26,7 +26,7 @@ from a2tg_jax.core.checks import (
     plain_array,
     short_repr,
 )
-from a2tg_jax.core.named_fields import NamedFields
+from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.core.numerics import safe_divide, safe_sqrt
 from a2tg_jax.core.pytree import pytree
 from a2tg_jax.core.sh import NUM_BASES, SH_C0

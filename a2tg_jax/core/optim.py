@@ -12,9 +12,9 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import DTypeLike
 
+from a2tg_jax.base.checks import check_array, check_floats, check_kind, check_number, check_numeric, check_shape
+from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.text import shortened
-from a2tg_jax.core.checks import check_array, check_floats, check_kind, check_number, check_numeric, check_shape
-from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.pytree import pytree
 
 with warnings.catch_warnings():

@@ -10,16 +10,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from a2tg_jax.base.checks import check_bounded, check_floats, check_shape
+from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.text import shortened
-from a2tg_jax.core.camera_paths import vertical_of
 from a2tg_jax.core.cameras import MAX_SKEW, Camera, check_calibration
-from a2tg_jax.core.checks import check_bounded, check_floats, check_shape
-from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.similarity import Similarity, check_similarity
 
 Color = tuple[float, float, float]
 BLACK: Color = (0.0, 0.0, 0.0)
 WHITE: Color = (1.0, 1.0, 1.0)
+FEWEST = 4
+"""Smallest number of cameras whose right axes are trusted over their mean up."""
+LEAST_SPREAD = 0.025
+"""Smallest second eigenvalue of the right axes' moments: headings that spread by 9°."""
+LARGEST_RATIO = 0.25
+"""Largest ratio of their first to their second eigenvalue."""
+LEAST_COSINE = 0.5
+"""Smallest cosine between the vertical and the cameras' mean up."""
 
 
 # eq=False: the generated == compares arrays, whose truth value is ambiguous.
@@ -127,3 +134,22 @@ def check_origin(origin: Origin) -> None:
     for name, rows in origin.corrections.items():
         check_floats(f"origin.corrections.{name}", rows, (len(origin.names), *np.shape(rows)[1:]))
         check_bounded(f"origin.corrections.{name}", rows)
+
+
+def vertical_of(viewmats: np.ndarray) -> np.ndarray:
+    """Return the vertical [3] of cameras [V, 4, 4], as the viewer estimates it (web/src/vertical.ts).
+
+    It is the axis closest to perpendicular to all right axes in least squares, or the cameras' mean up if the right
+    axes do not determine it.
+    """
+    up: np.ndarray = -viewmats[:, 1, :3].mean(axis=0)
+    up /= max(float(np.linalg.norm(up)), 1e-12)
+    rights = viewmats[:, 0, :3]
+    # `eigh` sorts eigenvalues in ascending order: the first vector is nearest to perpendicular to all rights.
+    (least, middle, _), vectors = np.linalg.eigh(rights.T @ rights / len(rights))
+    axis: np.ndarray = vectors[:, 0]
+    is_open = middle < LEAST_SPREAD or least > LARGEST_RATIO * middle
+    if len(viewmats) < FEWEST or is_open or abs(axis @ up) < LEAST_COSINE:
+        return up
+    # The sign of an eigenvector is arbitrary.
+    return np.asarray(axis * np.sign(axis @ up))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
-from a2tg_jax.core.named_fields import NamedFields
+from a2tg_jax.base.named_fields import NamedFields
 
 
 def how_to_convert(values: object, name: str) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from a2tg_jax.core.checks import LARGEST_NUMBER
+from a2tg_jax.base.checks import LARGEST_NUMBER
 from a2tg_jax.core.numerics import factor_to, normalize
 
 NUM_BASES = (1, 4, 9, 16)

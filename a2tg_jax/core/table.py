@@ -17,8 +17,8 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike, DTypeLike
 
-from a2tg_jax.core.checks import check_array, check_floats, check_kind, check_mask, check_shape, plain_array, short_repr
-from a2tg_jax.core.named_fields import NamedFields
+from a2tg_jax.base.checks import check_array, check_floats, check_kind, check_mask, check_shape, plain_array, short_repr
+from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.core.pytree import is_shared, partition, pytree, static
 
 T = TypeVar("T")

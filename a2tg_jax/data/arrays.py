@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from a2tg_jax import DepthMap, Mask, Picture, Scene
-from a2tg_jax.core.camera_paths import nearest_point
-from a2tg_jax.core.cameras import camera_centers, check_intrinsics
-from a2tg_jax.core.checks import check_kind, check_shape, check_unmasked, described, kind_of
+from a2tg_jax.base.checks import check_kind, check_shape, check_unmasked, described, kind_of
+from a2tg_jax.core.cameras import check_intrinsics
 from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.pictures import how_to_convert
 from a2tg_jax.data.assembly import (
@@ -23,6 +22,7 @@ from a2tg_jax.data.assembly import (
     rigid_viewmat,
     warn_of_rounding,
 )
+from a2tg_jax.data.capture_geometry import camera_centers, nearest_point
 from a2tg_jax.data.photo_points import MOST_VIEWS, Look, agreement
 
 OFF_CENTER = 1.25

@@ -16,10 +16,16 @@ from scipy.spatial.transform import Rotation
 
 from a2tg_jax import Camera, DepthMap, Mask, Picture, Scene, Similarity, View
 from a2tg_jax.base.text import counted, first_names, in_bytes
-from a2tg_jax.core.camera_paths import LEAST_FACING, distance_to_subject, nearest_point, outlying_cameras
-from a2tg_jax.core.cameras import LARGEST_COORDINATE, MAX_SKEW, camera_centers, check_calibration
+from a2tg_jax.core.cameras import LARGEST_COORDINATE, MAX_SKEW, check_calibration
 from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.sight import FIRST_LOOK, Sight, unseeing
+from a2tg_jax.data.capture_geometry import (
+    LEAST_FACING,
+    camera_centers,
+    distance_to_subject,
+    nearest_point,
+    outlying_cameras,
+)
 from a2tg_jax.data.photo_points import MOST_PLAIN, MOST_VIEWS, Look, agreeing_points, plain_share
 from a2tg_jax.scene import ray_bytes, rays_of_lenses
 

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from a2tg_jax import Scene, Similarity
 from a2tg_jax.base.regular_files import is_regular, names_in
 from a2tg_jax.base.text import counted
-from a2tg_jax.core.cameras import camera_centers
 from a2tg_jax.data.assembly import PointCloud, assemble_scene, every_kth, rigid_viewmat, scene_name
+from a2tg_jax.data.capture_geometry import camera_centers
 from a2tg_jax.data.colmap_cameras import ColmapCamera
 from a2tg_jax.data.colmap_files import KINDS, POINT, FrameRecord, ImageRecord, RigRecord, num_images, read_file
 from a2tg_jax.data.image_files import inside, on_disk, warn_of_unposed

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Literal
 
 from a2tg_jax import Scene
+from a2tg_jax.base.checks import check_literal
 from a2tg_jax.base.regular_files import expanded, is_regular
-from a2tg_jax.core.checks import check_literal
 from a2tg_jax.data.assembly import check_test_every, scene_name, warn_of_lenses, with_validation_views
 from a2tg_jax.data.colmap import find_models, load_colmap
 from a2tg_jax.data.lenses import LensUse, forget_rays

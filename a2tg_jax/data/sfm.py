@@ -14,11 +14,12 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from PIL import Image
 
+from a2tg_jax.base.checks import check_literal
 from a2tg_jax.base.machine import num_threads
 from a2tg_jax.base.regular_files import expanded
 from a2tg_jax.base.text import counted, first_names
-from a2tg_jax.core.camera_paths import upright_rotation, vertical_of
-from a2tg_jax.core.checks import check_literal
+from a2tg_jax.core.origin import vertical_of
+from a2tg_jax.data.capture_geometry import upright_rotation
 from a2tg_jax.data.colmap_cameras import ColmapCamera
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.decoding import picture_size, read_pixels

@@ -15,9 +15,9 @@ import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from a2tg_jax import Picture, Scene
-from a2tg_jax.core.cameras import intrinsics, looking
 from a2tg_jax.data import patterns
 from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, check_test_every, every_kth
+from a2tg_jax.data.camera_paths import intrinsics, looking
 from a2tg_jax.data.ray_tracing import (
     Ball,
     Block,

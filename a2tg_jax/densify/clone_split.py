@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from a2tg_jax.base.checks import check_number
 from a2tg_jax.core.budget import number_to_reach
-from a2tg_jax.core.checks import check_number
 from a2tg_jax.core.gaussians import Gaussians, rotation_matrices
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import partition, pytree, static

@@ -17,8 +17,8 @@ from jax.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from a2tg_jax.appearance import allocate_appearance, template_of
+from a2tg_jax.base.checks import check_number
 from a2tg_jax.core.cameras import back_project
-from a2tg_jax.core.checks import check_number
 from a2tg_jax.core.gaussians import Gaussians, no_rows, sh_of_colors
 from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.optim import AdamState

@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from a2tg_jax.base.checks import check_number
 from a2tg_jax.base.text import counted
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.checks import check_number
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.events import LEAST_LEFT, Change, Due, HostEvent, Times, keep_rows, times_at

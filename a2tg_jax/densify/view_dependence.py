@@ -15,8 +15,9 @@ from jax.typing import DTypeLike
 
 from a2tg_jax.appearance import in_words
 from a2tg_jax.appearance.parts import MAX_DEGREE, Coefficients, degrees_of_sizes, floats_of_band, sizes_of_degrees
-from a2tg_jax.core.budget import BYTES_PER_FLOAT, MOST_ROOM, bytes_of, event_budget, within_budget
-from a2tg_jax.core.checks import check_number
+from a2tg_jax.base.checks import check_number
+from a2tg_jax.base.text import bytes_of
+from a2tg_jax.core.budget import BYTES_PER_FLOAT, MOST_ROOM, event_budget, within_budget
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.sh import NUM_BASES, directions_from, sh_basis

@@ -21,13 +21,12 @@ import numpy as np
 from a2tg_jax import Camera, Gaussians, Gaussians2d, Model, Renderer, Scene, Similarity, TextureOptions, View, fit_stage
 from a2tg_jax.appearance.parts import MAX_DEGREE, curves_of, falloff_of, nearest_gaussians, texel_coordinates
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
-from a2tg_jax.core.camera_paths import without_outlying
-from a2tg_jax.core.cameras import camera_centers
 from a2tg_jax.core.gaussians import floats_per_gaussian, logit, rotation_matrices
 from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.origin import Color
 from a2tg_jax.core.sh import NUM_BASES, SH_C0
 from a2tg_jax.data.assembly import scene_scale
+from a2tg_jax.data.capture_geometry import camera_centers, matrices_of, without_outlying
 from a2tg_jax.finish.shrinking import fewest_texels, texel_weights
 from a2tg_jax.host.training_bar import ProgressBar
 from a2tg_jax.model import plain_gaussians
@@ -243,7 +242,7 @@ def drawn_scene(model: Model, cameras: Sequence[Camera], background: Color) -> S
     views = tuple(View(str(index), *pair) for index, pair in enumerate(zip(cameras, drawn, strict=True)))
     points = np.asarray(model.gaussians.means, np.float32)
     world = Similarity(1.0, np.eye(3), np.zeros(3)) if model.origin is None else model.origin.transform
-    centers = camera_centers(np.array([camera.viewmat for camera in without_outlying(cameras)], np.float64))
+    centers = camera_centers(matrices_of(without_outlying(cameras)))
     # Cameras in one place have no extent: the distance of the points is used instead.
     scale = scene_scale(centers) or float(np.median(np.linalg.norm(points - centers[0], axis=1)))
     return Scene("drawn", views, (), points, np.zeros_like(points), world, scale)

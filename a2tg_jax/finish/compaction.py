@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from a2tg_jax import Camera, Model, Renderer, RenderSettings, View, view_image
-from a2tg_jax.core.named_fields import NamedFields
+from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.core.origin import Color
 from a2tg_jax.host.progress_bars import progress_over
 from a2tg_jax.io.columns import Precision

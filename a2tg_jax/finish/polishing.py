@@ -19,7 +19,7 @@ from a2tg_jax import Camera, Model, RenderSettings, View, plan_render
 from a2tg_jax.appearance import in_words
 from a2tg_jax.appearance.base import color_sums
 from a2tg_jax.appearance.parts import MAX_DEGREE
-from a2tg_jax.core.checks import check_kind
+from a2tg_jax.base.checks import check_kind
 from a2tg_jax.core.optim import solve_cg
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.scene import check_are_views, views_by_kind

@@ -35,9 +35,9 @@ from a2tg_jax import (
 )
 from a2tg_jax.appearance import in_words, template_of
 from a2tg_jax.appearance.parts import LARGEST_LOG_EXPONENT, MAX_DEGREE, MOST_SHARE
-from a2tg_jax.core.checks import check_untraced
+from a2tg_jax.base.checks import check_untraced
+from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.core.gaussians import logit
-from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.numerics import normalize
 from a2tg_jax.finish.compaction import (
     LADDER,

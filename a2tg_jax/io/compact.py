@@ -18,13 +18,13 @@ import numpy as np
 from a2tg_jax import Appearance, Model
 from a2tg_jax.appearance.parts import MAX_DEGREE, log_exponents_of, shapes_of
 from a2tg_jax.base.atomic import write_whole
+from a2tg_jax.base.checks import check_int, check_literal
+from a2tg_jax.base.config_json import config_from_dict, config_to_dict
 from a2tg_jax.base.json_text import parse_json
+from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.regular_files import existing_bytes, expanded, reading, room_of
 from a2tg_jax.base.suffixes import check_suffix
-from a2tg_jax.core.checks import check_int, check_literal
-from a2tg_jax.core.config_json import config_from_dict, config_to_dict
 from a2tg_jax.core.gaussians import check_gaussians
-from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.io.columns import (
     MOST_BITS,
     AxisSteps,

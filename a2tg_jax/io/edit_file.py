@@ -11,12 +11,12 @@ import numpy as np
 from a2tg_jax import Model, Origin, Similarity
 from a2tg_jax.base.atomic import write_whole
 from a2tg_jax.base.json_text import numbers_of
+from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.text import shortened
-from a2tg_jax.core.floaters import floater_scores
-from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.origin import Color
 from a2tg_jax.core.similarity import check_similarity
 from a2tg_jax.io.columns import AxisSteps
+from a2tg_jax.io.floaters import floater_scores
 from a2tg_jax.io.saved_file import VERSION, load_saved
 
 # As in web/src/extent.ts.

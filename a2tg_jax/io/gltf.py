@@ -16,12 +16,12 @@ from a2tg_jax import Appearance, Model, TextureOptions
 from a2tg_jax.appearance import appearance_for
 from a2tg_jax.appearance.base import PARTS
 from a2tg_jax.appearance.parts import MAX_DEGREE, log_exponents_of, shapes_of
+from a2tg_jax.base.checks import check_int, check_literal
+from a2tg_jax.base.config_json import config_from_dict
 from a2tg_jax.base.json_text import numbers_of
 from a2tg_jax.base.regular_files import expanded, reading
 from a2tg_jax.base.suffixes import check_suffix
 from a2tg_jax.base.text import shortened
-from a2tg_jax.core.checks import check_int, check_literal
-from a2tg_jax.core.config_json import config_from_dict
 from a2tg_jax.core.sh import NUM_BASES, SH_C0
 from a2tg_jax.io.columns import Ends, dequantised, ends_of, quantised
 from a2tg_jax.io.gltf_container import Builder, Document, mesh_nodes, scene_of_one

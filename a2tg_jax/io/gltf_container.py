@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from a2tg_jax.base.atomic import replacing, write_whole
+from a2tg_jax.base.checks import check_int
 from a2tg_jax.base.json_text import numbers_of, parse_json
 from a2tg_jax.base.regular_files import (
     LARGEST_RATIO,
@@ -28,7 +29,6 @@ from a2tg_jax.base.regular_files import (
     room_of,
 )
 from a2tg_jax.base.text import PROGRAM, shortened
-from a2tg_jax.core.checks import check_int
 from a2tg_jax.data.ply import turn_of
 
 MAGIC = b"glTF"

@@ -23,14 +23,14 @@ from scipy.spatial.transform import Rotation
 from a2tg_jax import Gaussians, Model, Origin, Similarity, concatenate, transform_gaussians
 from a2tg_jax.appearance.parts import LEAST_OPACITY, MAX_DEGREE
 from a2tg_jax.base.atomic import write_whole
+from a2tg_jax.base.checks import LARGEST_NUMBER, check_literal
 from a2tg_jax.base.regular_files import existing_bytes, reading
 from a2tg_jax.base.text import counted, first_names, shortened
-from a2tg_jax.core.camera_paths import upright_rotation
-from a2tg_jax.core.checks import LARGEST_NUMBER, check_literal
 from a2tg_jax.core.gaussians import LARGEST_LOG_SCALE, LARGEST_OPACITY
 from a2tg_jax.core.origin import check_origin
 from a2tg_jax.core.sh import NUM_BASES, SH_C0
 from a2tg_jax.core.similarity import check_similarity
+from a2tg_jax.data.capture_geometry import upright_rotation
 from a2tg_jax.io.columns import logits_of, morton, opacities_of
 from a2tg_jax.model import check_model, plain_gaussians
 from a2tg_jax.model_file import origin_arrays, origin_header

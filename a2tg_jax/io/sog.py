@@ -24,10 +24,10 @@ from PIL import Image, UnidentifiedImageError
 from scipy import sparse
 
 from a2tg_jax import Model
+from a2tg_jax.base.checks import check_int
 from a2tg_jax.base.json_text import numbers_of, parse_json
 from a2tg_jax.base.regular_files import existing_bytes, read_regular, reading, room_of
 from a2tg_jax.base.text import PROGRAM, shortened
-from a2tg_jax.core.checks import check_int
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.data.decoding import MOST_BYTES
 from a2tg_jax.data.ply import OFFSET, ROTATION, turn_of

@@ -9,9 +9,9 @@ import dataclasses
 import numpy as np
 
 from a2tg_jax import Model
-from a2tg_jax.core.camera_paths import central_camera
 from a2tg_jax.core.gaussians import check_gaussians
 from a2tg_jax.core.numerics import evenly_chosen
+from a2tg_jax.data.capture_geometry import central_camera
 from a2tg_jax.io.columns import Choice, opacities_of
 from a2tg_jax.io.compact import CompactChoices, encode_model
 from a2tg_jax.io.edit_file import scores_of

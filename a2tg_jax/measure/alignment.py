@@ -15,8 +15,8 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from a2tg_jax.appearance import Appearance
+from a2tg_jax.base.checks import check_mask, check_shape
 from a2tg_jax.core.cameras import Camera, moved_viewmat
-from a2tg_jax.core.checks import check_mask, check_shape
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.optim import adam_init, adam_update
 from a2tg_jax.model import Model, check_is_model

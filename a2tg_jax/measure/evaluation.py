@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.text import counted
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
-from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.origin import Color
 from a2tg_jax.measure.alignment import color_fit
 from a2tg_jax.measure.metrics import load_lpips, lpips, psnr, ssim

@@ -16,13 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from a2tg_jax.base.checks import check_kind, check_shape, plain_array
+from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.npz import read_npz
 from a2tg_jax.base.regular_files import expanded, is_regular
 from a2tg_jax.base.text import shortened
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
-from a2tg_jax.core.checks import check_kind, check_shape, plain_array
 from a2tg_jax.core.gaussians import Gaussians
-from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.numerics import safe_norm
 from a2tg_jax.texture import BYTES_PER_TEXEL, Textures
 from a2tg_jax.training import losses

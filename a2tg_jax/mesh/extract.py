@@ -13,10 +13,10 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from a2tg_jax import Camera, Model, Renderer, RenderSettings
+from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.text import counted
-from a2tg_jax.core.camera_paths import nearest_point, outlying_cameras
-from a2tg_jax.core.cameras import camera_centers, checked_cameras
-from a2tg_jax.core.named_fields import NamedFields
+from a2tg_jax.core.cameras import checked_cameras
+from a2tg_jax.data.capture_geometry import camera_centers, nearest_point, outlying_cameras
 from a2tg_jax.host.optional import optional
 from a2tg_jax.host.progress_bars import progress_over
 from a2tg_jax.mesh.fusion import SIDE, VOXELS, BlockGrid, GridFullError, Space, fuse, rendered_depth

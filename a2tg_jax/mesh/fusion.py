@@ -12,8 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax import Camera, RenderOutput, pytree, static
-from a2tg_jax.core.cameras import back_project
+from a2tg_jax import Camera, RenderOutput, back_project, pytree, static
 from a2tg_jax.core.numerics import normalize
 
 TRUNCATION = 5.0

@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from a2tg_jax import Similarity
-from a2tg_jax.core.named_fields import NamedFields
+from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.host.optional import optional
 
 LEAST_FACES = 4

@@ -6,10 +6,10 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance import TextureOptions
+from a2tg_jax.base.checks import check_int, check_kind, check_literal, check_number, short_repr
+from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.core.cameras import Camera, resize_camera
-from a2tg_jax.core.checks import check_int, check_kind, check_literal, check_number, short_repr
 from a2tg_jax.core.geometry import NEAR_PLANE
-from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.notebook_display import as_bytes, enlarged, png
 from a2tg_jax.core.pytree import pytree
 from a2tg_jax.core.similarity import Similarity

@@ -15,8 +15,8 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance import Appearance
+from a2tg_jax.base.checks import check_kind
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.checks import check_kind
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.rasterize.compositor import list_tiles
 from a2tg_jax.rasterize.render_types import RenderSettings

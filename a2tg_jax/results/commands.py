@@ -7,9 +7,9 @@ import shlex
 from pathlib import Path
 
 from a2tg_jax.base.archive import read_archive_header
+from a2tg_jax.base.config_json import config_from_dict, config_to_dict
 from a2tg_jax.base.machine import ALONE, Devices
 from a2tg_jax.base.regular_files import is_regular
-from a2tg_jax.core.config_json import config_from_dict, config_to_dict
 from a2tg_jax.finish.tuning import ITERATIONS
 from a2tg_jax.results.finish_record import read_finish
 from a2tg_jax.results.folder import RunFolder

@@ -10,7 +10,6 @@ from PIL import ImageColor
 
 from a2tg_jax import Model, Origin
 from a2tg_jax.base.text import did_you_mean
-from a2tg_jax.core.camera_paths import vertical_in
 from a2tg_jax.core.origin import Color
 from a2tg_jax.io.edit_file import Edit, apply_edit, crop_box, save_edit
 from a2tg_jax.results.conversion import check_conversion, write_converted
@@ -100,7 +99,7 @@ def _vertical(text: str, model: Model) -> np.ndarray:
     if text in AXES:
         return origin.transform.rotation @ AXES[text]
     if text in origin.names:
-        return vertical_in(origin.viewmats[origin.names.index(text)], origin.vertical)
+        return _level_vertical(origin.viewmats[origin.names.index(text)], origin.vertical)
     hint = did_you_mean(text, origin.names)
     if not hint and origin.names:
         hint = f"; the first is {origin.names[0]}"
@@ -113,3 +112,11 @@ def _color(text: str) -> Color:
     except ValueError:
         raise ValueError(f"`background` must be a colour such as white or #ff8000; got {text!r}") from None
     return red / 255, green / 255, blue / 255
+
+
+def _level_vertical(viewmat: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Return the vertical [3] against which a camera is level, at the pitch that it has against the vertical `up`
+    [3]; as in web/src/vertical.ts."""
+    _, down, forward = viewmat[:3, :3]
+    pitch = np.clip(forward @ up, -0.99, 0.99)
+    return np.asarray(pitch * forward - np.sqrt(1 - pitch**2) * down)

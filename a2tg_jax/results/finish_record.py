@@ -3,8 +3,8 @@
 import dataclasses
 import math
 
+from a2tg_jax.base.config_json import config_from_dict
 from a2tg_jax.base.json_text import read_json
-from a2tg_jax.core.config_json import config_from_dict
 from a2tg_jax.results.folder import RunFolder
 
 

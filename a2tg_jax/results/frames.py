@@ -13,14 +13,14 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Literal, get_args
 
+import jax.numpy as jnp
 from PIL import Image
 
-from a2tg_jax import Camera, Model, Renderer, path_through, smooth_path
+from a2tg_jax import Camera, Model, Renderer, path_through, resize_camera, smooth_path, turntable
 from a2tg_jax.base.atomic import replacing, write_whole
 from a2tg_jax.base.regular_files import is_regular, read_regular
 from a2tg_jax.base.text import did_you_mean, shortened
-from a2tg_jax.core.camera_paths import turntable, without_outlying
-from a2tg_jax.core.cameras import crop_camera
+from a2tg_jax.data.capture_geometry import without_outlying
 from a2tg_jax.host.progress_bars import progress_over
 from a2tg_jax.io.path_file import load_views
 from a2tg_jax.results.folder import RunFolder
@@ -211,6 +211,16 @@ def _cameras(model: Model, route: Route | Path, num_frames: int) -> dict[str, Ca
         raise ValueError("the run has no test views; render a path instead with `path` smooth")
     names = picture_names(tests)
     return {names[name]: camera for name, camera in tests.items()}
+
+
+def crop_camera(camera: Camera, width: int, height: int) -> Camera:
+    """Return the view of a pinhole camera at another image size and aspect: scaled to cover it, and cropped around its
+    centre. Rays of a lens are left out."""
+    camera = dataclasses.replace(camera, rays=None)
+    factor = max(width / camera.width, height / camera.height)
+    scaled = resize_camera(camera, round(factor * camera.width), round(factor * camera.height))
+    shift = jnp.asarray([(width - scaled.width) / 2, (height - scaled.height) / 2], camera.K.dtype)
+    return Camera(camera.viewmat, scaled.K.at[:2, 2].add(shift), width, height)
 
 
 def _numbered(path: Sequence[Camera]) -> dict[str, Camera]:

@@ -10,8 +10,7 @@ import numpy as np
 
 from a2tg_jax import Origin, Renderer, view_image
 from a2tg_jax.base.machine import memory_limit
-from a2tg_jax.base.text import counted, in_bytes
-from a2tg_jax.core.budget import budget_in_bytes
+from a2tg_jax.base.text import budget_in_bytes, counted, in_bytes
 from a2tg_jax.host.progress_bars import progress_over
 from a2tg_jax.mesh.extract import MOST_CLUSTERS, check_lengths, extract_mesh
 from a2tg_jax.mesh.files import check_mesh_suffix, save_mesh

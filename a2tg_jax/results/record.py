@@ -29,11 +29,10 @@ import tomli_w
 
 from a2tg_jax import Bytewise, System, find_system, like
 from a2tg_jax.base.atomic import write_whole
+from a2tg_jax.base.config_json import changed_config, config_from_dict, config_to_dict, flatten_config, merged
 from a2tg_jax.base.json_text import MOST_TOML_BYTES, parse_toml
 from a2tg_jax.base.regular_files import expanded, is_regular, read_regular
-from a2tg_jax.base.text import did_you_mean, shortened
-from a2tg_jax.core.budget import MEGABYTE, budget_in_bytes, megabytes_of
-from a2tg_jax.core.config_json import changed_config, config_from_dict, config_to_dict, flatten_config, merged
+from a2tg_jax.base.text import MEGABYTE, budget_in_bytes, did_you_mean, megabytes_of, shortened
 from a2tg_jax.data.load import SceneSource
 from a2tg_jax.io.model_rows import check_encodable
 from a2tg_jax.results.commands import repeating_command

@@ -16,10 +16,10 @@ import numpy as np
 
 from a2tg_jax import Evaluation
 from a2tg_jax.base.atomic import write_whole
+from a2tg_jax.base.config_json import flatten_config
 from a2tg_jax.base.json_text import MOST_TOML_BYTES
 from a2tg_jax.base.regular_files import is_regular, read_regular
 from a2tg_jax.base.text import in_bytes
-from a2tg_jax.core.config_json import flatten_config
 from a2tg_jax.host.source_commit import source_commit
 from a2tg_jax.results.commands import repeating_command, training_command
 from a2tg_jax.results.figures import ReportFigure

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from a2tg_jax import Checkpoint, Model, Origin, Scene, StageResult, System, load_checkpoint, load_model, save_checkpoint
 from a2tg_jax.base.archive import read_archive_header
+from a2tg_jax.base.config_json import flatten_config
 from a2tg_jax.base.machine import this_machine
 from a2tg_jax.base.text import counted
-from a2tg_jax.core.config_json import flatten_config
 from a2tg_jax.model_file import FORMAT
 from a2tg_jax.results.folder import DAMAGED, StageFiles
 from a2tg_jax.results.plan import PlannedStage, is_same_so_far

@@ -6,8 +6,9 @@ from typing import Any, ClassVar, Self
 
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.appearance import Appearance, TexelRates, Texture, TextureOptions
-from a2tg_jax.core.budget import MEGABYTE, bytes_per_gaussian, megabytes_of
-from a2tg_jax.core.checks import check_number
+from a2tg_jax.base.checks import check_number
+from a2tg_jax.base.text import MEGABYTE, megabytes_of
+from a2tg_jax.core.budget import bytes_per_gaussian
 from a2tg_jax.core.gaussians import floats_per_gaussian
 from a2tg_jax.mcmc import Mcmc, Noise
 from a2tg_jax.systems.two_stages import (

@@ -11,8 +11,8 @@ from typing import ClassVar, Self
 
 from a2tg_jax.appearance import Appearance, Billboards, MovableKernels, Texture, TextureOptions
 from a2tg_jax.appearance.movable_kernels import FLOATS_PER_KERNEL, NUM_KERNELS
-from a2tg_jax.core.checks import check_number
-from a2tg_jax.core.named_fields import NamedFields
+from a2tg_jax.base.checks import check_number
+from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.densify.clone_split import CloneSplitPrune, OpacityReset
 from a2tg_jax.densify.pruning import Prune
 from a2tg_jax.mcmc import FillingMcmc, Mcmc, densify_times

@@ -6,9 +6,9 @@ from typing import Any, ClassVar, Self
 
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.appearance import Appearance, Bands, TexelRates, Texture, TextureOptions
-from a2tg_jax.base.text import shortened
-from a2tg_jax.core.budget import MEGABYTE, bytes_of, bytes_per_gaussian
-from a2tg_jax.core.checks import check_number
+from a2tg_jax.base.checks import check_number
+from a2tg_jax.base.text import MEGABYTE, bytes_of, shortened
+from a2tg_jax.core.budget import bytes_per_gaussian
 from a2tg_jax.densify.placing import PlaceByError
 from a2tg_jax.densify.pruning import Prune
 from a2tg_jax.densify.splitting import SplitByGradient

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 
 from a2tg_jax.appearance import Appearance, Exponents
 from a2tg_jax.appearance.parts import LARGEST_LOG_EXPONENT, MOST_SHARE
+from a2tg_jax.base.checks import check_number
 from a2tg_jax.base.text import shortened
-from a2tg_jax.core.checks import check_number
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree
 from a2tg_jax.densify.clone_split import CloneSplitPrune, FillingDensity

@@ -13,13 +13,13 @@ import numpy as np
 from a2tg_jax.appearance.base import check_appearance
 from a2tg_jax.appearance.files import arrays_of, with_arrays
 from a2tg_jax.base.archive import arrays_below, read_archive, write_archive
+from a2tg_jax.base.checks import check_count, check_finite, check_like
+from a2tg_jax.base.config_json import config_from_dict, config_to_dict, flatten_config
 from a2tg_jax.base.machine import ALONE, Devices, Machine, this_machine
+from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.regular_files import reading
 from a2tg_jax.base.text import counted, shortened
-from a2tg_jax.core.checks import check_count, check_finite, check_like
-from a2tg_jax.core.config_json import config_from_dict, config_to_dict, flatten_config
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
-from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import combine, partition
 from a2tg_jax.core.table import map_rows

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from a2tg_jax.base.checks import check_number
+from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.core.cameras import Camera, moved_viewmat
-from a2tg_jax.core.checks import check_number
-from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.optim import AdamState, adam_init, adam_update
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.pytree import pytree, static

@@ -10,11 +10,11 @@ from typing import Any
 import jax
 import numpy as np
 
+from a2tg_jax.base.checks import check_kind, check_untraced, kind_of
+from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.text import counted, in_bytes, shortened
 from a2tg_jax.core.budget import LARGEST_SHORTFALL
-from a2tg_jax.core.checks import check_kind, check_untraced, kind_of
 from a2tg_jax.core.gaussians import Gaussians
-from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.model import Model
 from a2tg_jax.scene import Scene, check_scene
 from a2tg_jax.training.checkpoint import Checkpoint, check_resume

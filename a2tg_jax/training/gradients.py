@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.appearance import Appearance, check_is_appearance
+from a2tg_jax.base.checks import check_literal, kind_of, short_repr
 from a2tg_jax.core.cameras import Camera, check_camera
-from a2tg_jax.core.checks import check_literal, kind_of, short_repr
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.numerics import safe_norm
 from a2tg_jax.core.pytree import combine, partition

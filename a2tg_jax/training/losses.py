@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from a2tg_jax.base.checks import check_array, check_floats, check_number, check_shape, plain_array
 from a2tg_jax.core.cameras import Camera, back_project, check_is_camera
-from a2tg_jax.core.checks import check_array, check_floats, check_number, check_shape, plain_array
 from a2tg_jax.core.numerics import normalize, safe_divide
 from a2tg_jax.rasterize.kernels import window_scores
 from a2tg_jax.rasterize.kernels.score import Score

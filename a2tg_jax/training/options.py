@@ -5,11 +5,11 @@ import math
 import typing
 from typing import Any, ClassVar, Literal, Self
 
-from a2tg_jax.base.text import did_you_mean, in_bytes, shortened
-from a2tg_jax.core.budget import BYTES_PER_FLOAT, budget_in_bytes, bytes_per_gaussian, megabytes_of
-from a2tg_jax.core.checks import check_int, check_number, fields_of
-from a2tg_jax.core.config_json import changed_config, check_config, config_to_dict, flatten_config
-from a2tg_jax.core.named_fields import NamedFields
+from a2tg_jax.base.checks import check_int, check_number, fields_of
+from a2tg_jax.base.config_json import changed_config, check_config, config_to_dict, flatten_config
+from a2tg_jax.base.named_fields import NamedFields
+from a2tg_jax.base.text import budget_in_bytes, did_you_mean, in_bytes, megabytes_of, shortened
+from a2tg_jax.core.budget import BYTES_PER_FLOAT, bytes_per_gaussian
 from a2tg_jax.events import Event
 from a2tg_jax.rasterize.kernels.platforms import MAX_TILE_SIZE
 from a2tg_jax.training.corrections import BilateralGrid, Correction, Exposure, PoseRefinement

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from a2tg_jax.base.checks import check_shape
 from a2tg_jax.base.text import first_names, shortened
-from a2tg_jax.core.checks import check_shape
 from a2tg_jax.scene import View
 
 UNKNOWN = -1

@@ -5,8 +5,8 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
+from a2tg_jax.base.config_json import config_from_dict, config_to_dict
 from a2tg_jax.base.text import did_you_mean, shortened
-from a2tg_jax.core.config_json import config_from_dict, config_to_dict
 from a2tg_jax.training.options import System
 
 SYSTEMS = {

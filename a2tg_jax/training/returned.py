@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
+from a2tg_jax.base.checks import check_kind, check_like, described, dtype_of
 from a2tg_jax.base.text import shortened
-from a2tg_jax.core.checks import check_kind, check_like, described, dtype_of
 from a2tg_jax.core.gaussians import check_gaussians
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import partition

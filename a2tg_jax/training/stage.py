@@ -16,11 +16,11 @@ from jax import Array
 
 from a2tg_jax.appearance import Appearance, allocate_appearance, count_floats, in_words
 from a2tg_jax.appearance.base import check_appearance
+from a2tg_jax.base.checks import check_kind, check_literals, check_number, fields_of, kind_of
+from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.text import shortened
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
-from a2tg_jax.core.checks import check_kind, check_literals, check_number, fields_of, kind_of
 from a2tg_jax.core.gaussians import Gaussians, no_rows
-from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.origin import BLACK, WHITE, Color
 from a2tg_jax.core.pytree import beside, check_pytree, pytree, static
 from a2tg_jax.core.sh import NUM_BASES

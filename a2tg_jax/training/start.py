@@ -13,8 +13,8 @@ from jax import Array
 from a2tg_jax.appearance import Appearance, allocate_appearance, template_of
 from a2tg_jax.appearance.base import check_appearance, join_rows, without_arrays
 from a2tg_jax.appearance.parts import Part, nearest_gaussians
+from a2tg_jax.base.checks import fields_of
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.checks import fields_of
 from a2tg_jax.core.gaussians import INITIAL_OPACITY, Gaussians, init_from_points, no_rows
 from a2tg_jax.core.geometry import FILTER_VARIANCE, pixel_sizes
 from a2tg_jax.core.optim import adam_init

@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.numerics import safe_divide
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.model import Model

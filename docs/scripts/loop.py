@@ -10,7 +10,6 @@ import numpy as np
 from PIL import Image
 
 import a2tg_jax as a2tg
-from a2tg_jax.core.camera_paths import turntable
 from a2tg_jax.results.images import save_animation, to_uint8
 
 FROM, TO = -55.0, 85.0
@@ -25,7 +24,7 @@ def main(model: pathlib.Path, out: pathlib.Path, num_frames: int = NUM_FRAMES) -
     found = a2tg.load_model(model)
     assert found.origin is not None
     draw = a2tg.Renderer(found)
-    ring = turntable(found.origin.cameras, 360)
+    ring = a2tg.turntable(found.origin.cameras, 360)
     # Slow at both ends, where it turns.
     shares = (1 - np.cos(np.pi * np.arange(num_frames) / (num_frames - 1))) / 2
     degrees = np.rint(FROM + (TO - FROM) * shares).astype(int)

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import a2tg_jax as a2tg
+from a2tg_jax.base.config_json import changed_config, merged
 from a2tg_jax.base.json_text import read_json
-from a2tg_jax.base.text import did_you_mean
-from a2tg_jax.core.budget import BYTES_PER_FLOAT, MEGABYTE
-from a2tg_jax.core.config_json import changed_config, merged
+from a2tg_jax.base.text import MEGABYTE, did_you_mean
+from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from lab.grid_file import (
     GRIDS,
     SIZES,

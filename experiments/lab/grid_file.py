@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
+from a2tg_jax.base.config_json import config_from_dict
 from a2tg_jax.base.json_text import MOST_TOML_BYTES, parse_toml
 from a2tg_jax.base.regular_files import read_regular
 from a2tg_jax.base.text import shortened
-from a2tg_jax.core.config_json import config_from_dict
 
 GRIDS = Path(__file__).resolve().parents[1] / "grids"
 SUFFIX = ".toml"

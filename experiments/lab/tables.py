@@ -14,7 +14,8 @@ import numpy as np
 import scipy.stats
 
 from a2tg_jax.base.json_text import read_json
-from a2tg_jax.core.budget import MEGABYTE, bytes_per_gaussian
+from a2tg_jax.base.text import MEGABYTE
+from a2tg_jax.core.budget import bytes_per_gaussian
 from lab.grid import Cell, Grid, Run
 from lab.jobs import Record
 from lab.markdown import table as markdown

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
-from a2tg_jax.core.cameras import camera_centers
+from a2tg_jax.data.capture_geometry import camera_centers
 
 NUM_NEIGHBOURS = 8
 MOST_CAMERAS = 64

@@ -94,6 +94,17 @@ def check_number(
     """Raise ValueError unless a value is one real number within limits; NaN is within none.
 
     A scalar array is a number. Values of tracers are not read.
+
+    Args:
+      name: the value's name in the error.
+      value: any value.
+      least: limit that the value may equal.
+      above: limit that the value may not equal.
+      most: upper limit that the value may equal.
+      below: upper limit that the value may not equal.
+
+    Raises:
+      ValueError: naming the value, the limits and what it is.
     """
     limits = {"at least": least, "above": above, "at most": most, "below": below}
     wanted = " and ".join(f"{word} {limit:g}" for word, limit in limits.items() if limit is not None)

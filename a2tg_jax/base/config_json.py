@@ -7,8 +7,8 @@ import typing
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
+from a2tg_jax.base.checks import check_kind
 from a2tg_jax.base.text import did_you_mean, shortened
-from a2tg_jax.core.checks import check_kind
 
 ConfigT = TypeVar("ConfigT")
 LARGEST_INTEGER = 2**64  # JSON's integers have no bound in Python; NumPy and JAX take 64 bits.
