@@ -14,8 +14,8 @@ import a2tg_jax as a2tg
 from a2tg_jax import BilateralGrid, Due, Geometry, LossConfig, adam_init
 from a2tg_jax.data.photo_reading import find_depths, read_depths
 from a2tg_jax.densify.pruning import shown_in
+from a2tg_jax.results.run_evaluation import learned_corrections
 from a2tg_jax.training.batches import stack_views
-from a2tg_jax.training.corrections import learned
 from a2tg_jax.training.start import initial_model
 from a2tg_jax.training.terms import inliers, scale_and_shift
 
@@ -149,7 +149,7 @@ class TestBilateralGrid:
         grids = origin.corrections["bilateral_grid"]
         assert grids.shape == (5, 2, 4, 4, 3, 4)
         assert np.abs(grids[: len(scene.train)] - np.eye(3, 4)).max() > 1e-4
-        assert all(set(found) == {"exposure"} for found in learned(origin).values())
+        assert all(set(found) == {"exposure"} for found in learned_corrections(origin).values())
 
 
 def depth_term(kind="inverse"):

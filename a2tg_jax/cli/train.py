@@ -39,8 +39,7 @@ from a2tg_jax.results.record import (
 from a2tg_jax.results.report import RunResult, sizes_line, summary_text
 from a2tg_jax.results.run_processes import check_batch_sizes, follow_first_process
 from a2tg_jax.results.run_training import RunOptions, begin_run, resume_run, unseen, warn
-from a2tg_jax.results.viewing import shown_live
-from a2tg_jax.training.loop import Watch
+from a2tg_jax.results.viewing import LiveView, shown_live
 
 FLAGS[SceneSource] = {"path": (Positional, arg(metavar="SCENE", help_behavior_hint="(required)"))}
 FLAGS[RunRecord] = {
@@ -392,7 +391,7 @@ def print_result(result: RunResult, folder: Path) -> None:
     print(f"{summary_text(result)}\n{sizes_line(run, result)}\nreport: {run.report}")
 
 
-def in_browser(scene: Scene) -> AbstractContextManager[Watch]:
+def in_browser(scene: Scene) -> AbstractContextManager[LiveView]:
     """Show the training of a scene in a browser."""
 
     def started(address: str) -> None:

@@ -18,7 +18,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax import Camera, Gaussians, Gaussians2d, Model, Renderer, Scene, Similarity, TextureOptions, View, fit_stage
+from a2tg_jax import (
+    Camera,
+    Gaussians,
+    Gaussians2d,
+    Model,
+    Progress,
+    Renderer,
+    Scene,
+    Similarity,
+    TextureOptions,
+    View,
+    fit_stage,
+)
 from a2tg_jax.appearance.parts import MAX_DEGREE, curves_of, falloff_of, nearest_gaussians, texel_coordinates
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.gaussians import floats_per_gaussian, logit, rotation_matrices
@@ -31,8 +43,6 @@ from a2tg_jax.finish.shrinking import fewest_texels, texel_weights
 from a2tg_jax.host.training_bar import ProgressBar
 from a2tg_jax.model import plain_gaussians
 from a2tg_jax.texture import NEUTRAL_TEXEL
-from a2tg_jax.training.reports import Progress
-from a2tg_jax.training.stage import BACKGROUNDS, Background
 
 MOST_GROWTH = 2.0
 """Largest ratio of the bytes after baking to those before."""
@@ -226,11 +236,12 @@ def distill(
     Both are rendered over black or white, whichever is nearer to the other model's background. Each iteration renders
     one view.
     """
-    highest = model.gaussians.sh_degree
-    behind: Background = "white" if np.mean(wanted.background) > 0.5 else "black"
     # Only the second stage runs: it does not change the number of Gaussians.
-    system = Gaussians2d(stage1_iterations=1, stage2_iterations=iterations, sh_degree=highest, background=behind)
-    scene = drawn_scene(wanted, cameras, BACKGROUNDS[behind])
+    system = Gaussians2d(
+        stage1_iterations=1, stage2_iterations=iterations, sh_degree=model.gaussians.sh_degree,
+        background="white" if np.mean(wanted.background) > 0.5 else "black",
+    )  # fmt: skip
+    scene = drawn_scene(wanted, cameras, system.background_color)
     start = dataclasses.replace(model, origin=None)
     trained = fit_stage(scene, system, 1, start, progress=Progress(ProgressBar if progress else None, "bake")).model
     return dataclasses.replace(trained, origin=wanted.origin)

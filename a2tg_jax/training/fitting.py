@@ -24,7 +24,7 @@ from a2tg_jax.training.history import History
 from a2tg_jax.training.loop import IsStopped, OnCheckpoint, OnLog, Session, StageRun, never
 from a2tg_jax.training.options import System
 from a2tg_jax.training.reports import Display, Progress, RestOfRun
-from a2tg_jax.training.stage import BACKGROUNDS, Stage
+from a2tg_jax.training.stage import Stage
 from a2tg_jax.training.start import check_points, given_model, initial_model
 
 
@@ -337,7 +337,7 @@ def _check_stage(resume: Checkpoint, stages: Sequence[Stage], index: int) -> Non
 def _result_of(run: StageRun, scene: Scene, *, is_last: bool) -> StageResult:
     """Return the result of a trained stage."""
     origin = corrected_origin(scene.origin, run.stage.corrections, run.whole_state.corrections)
-    model = dataclasses.replace(run.model, background=BACKGROUNDS[run.system.background], origin=origin)
+    model = dataclasses.replace(run.model, background=run.system.background_color, origin=origin)
     if is_last:
         warn_of_budget(run.system, model)
     return StageResult(run.stage.name, model, run.history, run.seconds, run.num_regrown)

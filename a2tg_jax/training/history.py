@@ -6,8 +6,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.text import counted
-from a2tg_jax.core.named_fields import NamedFields
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

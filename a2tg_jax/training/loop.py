@@ -34,7 +34,6 @@ from a2tg_jax.training.options import System
 from a2tg_jax.training.recorded_views import RecordedViews
 from a2tg_jax.training.reports import Display, LearningCheck, Pace, Progress, StageEffects
 from a2tg_jax.training.returned import calling, checked_change
-from a2tg_jax.training.stage import BACKGROUNDS
 from a2tg_jax.training.start import state_of_model
 from a2tg_jax.training.step import (
     EXPLODED,
@@ -430,8 +429,7 @@ class StageRun:
 
     def _apply(self, place: int, event: HostEvent, index: int, count: int) -> None:
         """Apply the event at a place, for the `index`-th of `count` times."""
-        background = BACKGROUNDS[self.system.background]
-        due = Due(index, count, self.views, background, self.system.seed, self.session.shapes)
+        due = Due(index, count, self.views, self.system.background_color, self.system.seed, self.session.shapes)
         with calling(event, "apply", self.stage.name):
             change = event.apply(due, self.state.model, self.state.moments, self.state.events[place])
             change = checked_change(change)

@@ -10,10 +10,11 @@ from a2tg_jax.base.config_json import changed_config, check_config, config_to_di
 from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.text import budget_in_bytes, did_you_mean, in_bytes, megabytes_of, shortened
 from a2tg_jax.core.budget import BYTES_PER_FLOAT, bytes_per_gaussian
+from a2tg_jax.core.origin import BLACK, WHITE, Color
 from a2tg_jax.events import Event
 from a2tg_jax.rasterize.kernels.platforms import MAX_TILE_SIZE
 from a2tg_jax.training.corrections import BilateralGrid, Correction, Exposure, PoseRefinement
-from a2tg_jax.training.stage import LearningRates, LossTerm, Stage
+from a2tg_jax.training.stage import Background, LearningRates, LossTerm, Stage
 from a2tg_jax.training.terms import (
     DepthKind,
     DepthPrior,
@@ -129,7 +130,7 @@ class System(NamedFields):
     """Budget of the model's bytes in memory, not in files: 1.5MB, 800kB, 2GB, or a number of MB (10^6 bytes). The
     model stays within it at every iteration and ends within 0.5 % of it. It sets the number of Gaussians and texels,
     instead of densify.cap."""
-    background: Literal["black", "white", "random"] = "black"
+    background: Background = "black"
     """Background of renders, and of transparent photographs."""
     sh_degree: int = 3
     """Highest degree of spherical harmonics, 0 to 3."""
@@ -162,6 +163,12 @@ class System(NamedFields):
         object.__setattr__(self, "memory_budget", megabytes_of(self.memory_budget))
         if isinstance(self.more, list):  # A list equals no tuple.
             object.__setattr__(self, "more", tuple(self.more))
+
+    @property
+    def background_color(self) -> Color:
+        """Background of its models, and of what events on the host render, RGB in [0, 1]; black where training takes
+        random ones."""
+        return WHITE if self.background == "white" else BLACK
 
     @property
     def initial_sh_degree(self) -> int:

@@ -21,7 +21,6 @@ from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.text import shortened
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.gaussians import Gaussians, no_rows
-from a2tg_jax.core.origin import BLACK, WHITE, Color
 from a2tg_jax.core.pytree import beside, check_pytree, pytree, static
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.events import Event, HostEvent, StepEvent, Times, every_iteration
@@ -77,8 +76,7 @@ T = TypeVar("T")
 COOLED = 0.1
 """Factor of learning rates at the end of a stage that cools down."""
 Background = Literal["black", "white", "random"]
-BACKGROUNDS: dict[Background, Color] = {"black": BLACK, "white": WHITE, "random": BLACK}
-"""Background of models, and of what events on the host render, for each background of training."""
+"""Background of the views while a stage is trained."""
 
 
 class LossTerm(Protocol):
