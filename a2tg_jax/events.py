@@ -7,6 +7,7 @@ either happens inside the step, at fixed shapes (`StepEvent`), or between steps 
 """
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
@@ -16,6 +17,7 @@ import numpy as np
 from jax import Array
 from jax.typing import DTypeLike
 
+from a2tg_jax.appearance import template_of
 from a2tg_jax.appearance.base import clear_rows
 from a2tg_jax.base.checks import check_floats, check_mask, check_shape
 from a2tg_jax.base.named_fields import NamedFields
@@ -28,6 +30,8 @@ from a2tg_jax.core.pytree import combine, partition, pytree
 from a2tg_jax.core.table import Shape, map_rows, rows_moved
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.pixel import Statistic as Statistic
+from a2tg_jax.rasterize.render_types import RenderSettings
+from a2tg_jax.rasterize.room import TileRoom, most_pairs
 from a2tg_jax.scene import View
 
 LEAST_LEFT = 2
@@ -111,6 +115,20 @@ class Due(NamedFields):
     """Random seed of the system, for draws of the event."""
     shapes: set[Shape] = dataclasses.field(default_factory=set)
     """Shapes of textures that steps are compiled for; an event adds the shapes that it makes."""
+    room: TileRoom = dataclasses.field(default_factory=TileRoom)
+    """Capacities of tile lists that steps are compiled for."""
+
+    def render_settings(self, model: Model, views: Sequence[View]) -> RenderSettings:
+        """Return settings for renders of some views, with the capacity of steps if it suffices (host). ValueError:
+        there are no views."""
+        if not views:
+            raise ValueError("views must hold at least one view; got none")
+        settings = RenderSettings()
+        cameras = [view.camera for view in views]
+        pairs = most_pairs(model.gaussians, cameras, model.appearance, settings, model.num_live)
+        # As in the training loop.
+        place = template_of(model.appearance), model.num_rows, *max(view.picture.size for view in views)
+        return dataclasses.replace(settings, capacity=self.room.plan(place, pairs, most=math.inf))
 
 
 class EventInfo(NamedTuple):

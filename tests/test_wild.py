@@ -275,8 +275,8 @@ class TestFloaters:
         picture = np.zeros((camera.height, camera.width, 3), np.uint8)
         turned = dataclasses.replace(camera, viewmat=camera.viewmat.at[0, 3].add(0.7))
         views = [a2tg.View(str(index), each, picture) for index, each in enumerate((camera, turned))]
-        found = shown_in(model, views, least=2.0)
-        alone = [shown_in(model, [view]).weights for view in views]
+        found = shown_in(model, Due(views=views), least=2.0)
+        alone = [shown_in(model, Due(views=[view])).weights for view in views]
         np.testing.assert_array_equal(found.num_views, sum(weights >= 2.0 for weights in alone))
         assert len(set(found.num_views.tolist())) > 1
         change = a2tg.PruneFloaters(min_views=2, least=2.0).apply(

@@ -383,7 +383,7 @@ class StageRun:
         return dataclasses.replace(settings, capacity=self.capacities[size])
 
     def _place(self, size: Size) -> tuple[object, ...]:
-        """Return the key of a capacity of the session: stages that show the same share it."""
+        """Return the place of a capacity in the session's room: stages that show the same share it."""
         return self.stage.appearance, self.state.model.num_rows, *size
 
     def _after_failure(self, iteration: int, info: StepInfo) -> None:
@@ -429,7 +429,10 @@ class StageRun:
 
     def _apply(self, place: int, event: HostEvent, index: int, count: int) -> None:
         """Apply the event at a place, for the `index`-th of `count` times."""
-        due = Due(index, count, self.views, self.system.background_color, self.system.seed, self.session.shapes)
+        due = Due(
+            index, count, self.views, self.system.background_color, self.system.seed, self.session.shapes,
+            self.session.room,
+        )  # fmt: skip
         with calling(event, "apply", self.stage.name):
             change = event.apply(due, self.state.model, self.state.moments, self.state.events[place])
             change = checked_change(change)
