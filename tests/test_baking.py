@@ -192,7 +192,7 @@ def test_training_brings_a_plain_model_nearer_over_its_background():
     """Cameras in one place, which have no extent, move the means as well."""
     wanted = dataclasses.replace(textured(), background=(1.0, 1.0, 1.0))
     start = split_splats(wanted)
-    trained = bake(wanted, [CAMERA], iterations=30)
+    trained = bake(wanted, [CAMERA], growth=2.0, iterations=30)
     assert trained.num == start.num and trained.origin == wanted.origin
     assert (np.asarray(trained.gaussians.means) != np.asarray(start.gaussians.means)).any()
     assert psnr(trained, wanted) > psnr(start, wanted) + 0.5
@@ -228,9 +228,10 @@ def test_plain_files_hold_the_nearest_gaussians(tmp_path):
 
 def test_other_appearances_give_their_gaussians():
     model = dataclasses.replace(Model(some_gaussians(5)), origin=Origin.of_cameras([CAMERA]))
-    np.testing.assert_array_equal(bake(model, [CAMERA], iterations=0).gaussians.means, model.gaussians.means)
+    baked = bake(model, [CAMERA], growth=2.0, iterations=0)
+    np.testing.assert_array_equal(baked.gaussians.means, model.gaussians.means)
     with pytest.raises(ValueError, match="growth of at least 1"):
-        bake(model, [CAMERA], growth=0.5)
+        bake(model, [CAMERA], growth=0.5, iterations=0)
 
 
 @pytest.mark.long

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tomllib
 import warnings
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -25,8 +26,10 @@ from small_models import origin_of
 
 from a2tg_jax import find_system, load_model, load_ply, save_model
 from a2tg_jax.cli import doctor, main as cli
+from a2tg_jax.cli.arguments import deciding_options
 from a2tg_jax.cli.train import Train, train_defaults
 from a2tg_jax.data.load import SceneSource
+from a2tg_jax.data.synthetic import BUILT_IN
 from a2tg_jax.host import startup
 from a2tg_jax.results import finishing, page_export, run_training, stage_training
 from a2tg_jax.results.folder import RunFolder
@@ -106,18 +109,70 @@ def test_training_without_a_scene_says_so(capsys, tmp_path):
     assert "SCENE is missing" in fails(capsys, "train", "--out", tmp_path / "run")
 
 
-def run_python(*words: str, **environment: str) -> subprocess.CompletedProcess:
+def run_python(*words: str, cwd: Path | None = None, **environment: str) -> subprocess.CompletedProcess:
     environment = {**os.environ, **environment}
-    return subprocess.run([sys.executable, *words], capture_output=True, text=True, check=False, env=environment)
+    return subprocess.run(
+        [sys.executable, *words], capture_output=True, text=True, check=False, env=environment, cwd=cwd
+    )
 
 
-def test_a_mistyped_command_is_one_line_and_imports_no_jax():
+def test_a_mistyped_command_is_one_line():
     done = run_python("-m", "a2tg_jax", "trian")
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith("a2tg: error: ") and done.stderr.count("\n") == 1
-    script = "import sys; from a2tg_jax.cli.main import main; codes = main(['trian']), main(['--help']), main([])"
-    done = run_python("-c", f"{script}; sys.exit(str((codes, 'jax' in sys.modules, 'tyro' in sys.modules)))")
-    assert done.stderr.splitlines()[-1] == "((2, 0, 0), False, False)"
+
+
+SLOW = ("jax", "scipy", "matplotlib")
+"""Modules whose import takes tenths of a second."""
+ANSWERED_AT_ONCE = (
+    "",
+    "trian",
+    "--help",
+    "--version",
+    "train nowhere --out new",
+    "train --out nowhere --resume",
+    "render nowhere --frames 9",
+    "convert nowhere.ply out.sog",
+    "sfm nowhere scene",
+    *(f"{name} --help" for name in cli.COMMANDS if name not in ("train", "download")),
+    *(f"{name} --nosuch" for name in cli.COMMANDS if name not in ("train", "download")),
+)
+"""Words that are answered without JAX."""
+
+
+def test_words_that_need_no_jax_import_none(tmp_path):
+    script = f"""
+import sys
+from a2tg_jax.cli.main import main
+for words in {ANSWERED_AT_ONCE!r}:
+    code = main(words.split())
+    imported = [name for name in {SLOW!r} if name in sys.modules]
+    assert not imported, (words, imported)
+    assert code == (0 if words in ("", "--version") or words.endswith("--help") else 2), (words, code)
+"""
+    done = run_python("-c", script, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+def test_the_short_help_of_train_precedes_the_import_of_jax():
+    script = """
+import sys
+from a2tg_jax.cli.main import TRAIN_HELP, main
+class Output:
+    def write(self, text):
+        if TRAIN_HELP in text:
+            assert "jax" not in sys.modules
+            sys.__stdout__.write("first")
+    def flush(self): pass
+sys.stdout = Output()
+assert main(["train", "--help"]) == 0 and "jax" in sys.modules
+"""
+    done = run_python("-c", script)
+    assert (done.returncode, done.stdout) == (0, "first"), done.stderr
+
+
+def test_built_in_scenes_need_no_folder():
+    assert set(BUILT_IN) == cli.BUILT_IN
 
 
 def test_debugging_shows_the_traceback(tmp_path, monkeypatch):
@@ -386,7 +441,8 @@ def test_validation_views_replace_test_views(run, tmp_path, capsys):
     copy = RunFolder(shutil.copytree(run.path, tmp_path / "copy"))
     record = dataclasses.replace(read_record(run), scene=SceneSource("synthetic", 5, validation=True))
     write_record(copy, record)
-    assert read_record(copy) == record and train_defaults(["--config", str(copy.record)]).record.scene.validation
+    given = deciding_options(["--config", str(copy.record)])
+    assert read_record(copy) == record and train_defaults(given).record.scene.validation
     assert cli.main(["eval", str(copy.path)]) == 2
     assert "was trained on 3 views that synthetic now holds out" in capsys.readouterr().err
     origin = origin_of(record.scene.load())

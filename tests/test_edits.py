@@ -19,7 +19,8 @@ from a2tg_jax.io.columns import decode
 from a2tg_jax.io.edit_file import largest_score, scores_of
 from a2tg_jax.io.floaters import floater_scores
 from a2tg_jax.io.web_scene import encode_web_scene
-from a2tg_jax.results.editing import EditOptions
+from a2tg_jax.results.editing import edit_of
+from a2tg_jax.results.options import EditOptions
 
 NOWHERE = Similarity(1.0, np.eye(3), np.zeros(3))
 TILTED = Rotation.from_euler("xy", [25, 10], degrees=True).as_matrix()
@@ -150,7 +151,7 @@ def test_an_edit_from_flags(tmp_path, capsys):
     edited = a2tg.apply_edit(model, edit)
     assert f"an edit that keeps {edited.num} of 60 Gaussians" in capsys.readouterr().out and 5 < edited.num < 55
     np.testing.assert_array_equal(a2tg.load_model(tmp_path / "a.npz").gaussians.means, edited.gaussians.means)
-    edit = EditOptions(upright="-y").edit_of(model)
+    edit = edit_of(EditOptions(upright="-y"), model)
     np.testing.assert_allclose(model.origin.transform.inverse().rotation @ edit.up, [0, -1, 0], atol=1e-12)
 
 
@@ -166,7 +167,7 @@ def test_an_edit_from_flags(tmp_path, capsys):
 )
 def test_flags_of_edits_are_checked(options, message):
     with pytest.raises(ValueError, match=message):
-        options.edit_of(captured(NOWHERE))
+        edit_of(options, captured(NOWHERE))
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from a2tg_jax import Mcmc, Picture, Prune, resize_camera
 from a2tg_jax.base import machine
 from a2tg_jax.base.machine import allowed_memory
 from a2tg_jax.cli import main as cli
-from a2tg_jax.cli.train import ask
+from a2tg_jax.cli.training import ask
 from a2tg_jax.host import progress_bars
 from a2tg_jax.results import forecast
 from a2tg_jax.results.commands import quick_flags

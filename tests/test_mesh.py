@@ -1,6 +1,7 @@
 """Meshes: fusion of exact depths, marching cubes over bricks, cleaning, files, distances, and the command."""
 
 import dataclasses
+import inspect
 import json
 import struct
 import sys
@@ -22,6 +23,7 @@ from a2tg_jax.mesh.fusion import BlockGrid, RenderedDepth, Space, fuse
 from a2tg_jax.mesh.texturing import draw_view
 from a2tg_jax.mesh.triangles import largest_clusters
 from a2tg_jax.results import meshing
+from a2tg_jax.results.options import MeshOptions
 
 SIDE = 48
 RADIUS = 0.5
@@ -443,3 +445,7 @@ def test_exact_points_lie_where_the_pictures_say():
 def test_mistakes_of_textures(model, tmp_path, monkeypatch, capsys, arguments, message):
     pytest.importorskip("xatlas", reason="textures need xatlas: pip install 'a2tg-jax[mesh]'")
     test_mistakes_of_the_command(model, tmp_path, monkeypatch, capsys, f"mesh cameras.npz {arguments}", message)
+
+
+def test_the_command_keeps_as_many_parts_as_the_library():
+    assert inspect.signature(a2tg.extract_mesh).parameters["most_clusters"].default == MeshOptions.clusters

@@ -16,6 +16,7 @@ import a2tg_jax as a2tg
 from a2tg_jax import Session, fit_stage, load_model
 from a2tg_jax.base.machine import Devices
 from a2tg_jax.cli import main as cli
+from a2tg_jax.cli.arguments import deciding_options
 from a2tg_jax.cli.processes import LOST, is_lost
 from a2tg_jax.cli.train import train_defaults
 from a2tg_jax.results import run_processes
@@ -134,7 +135,7 @@ def test_digests_differ_where_training_would():
 def test_a_process_that_follows_may_have_the_scene_elsewhere(tmp_path):
     run = create_run(tmp_path / "run")
     write_record(run, RunRecord(SceneSource("/there"), "gaussians-2d-mcmc", a2tg.Gaussians2dMcmc()))
-    train = train_defaults(["--resume", "--out", str(run.path), "--coordinator", "h:1"])
+    train = train_defaults(deciding_options(["--resume", "--out", str(run.path), "--coordinator", "h:1"]))
     record = dataclasses.replace(train.record, scene=SceneSource(str(tmp_path)))
     train = dataclasses.replace(train, record=record, out=run.path)
     assert train.resumed(run, is_first=False).scene.path == str(tmp_path)

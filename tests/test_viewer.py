@@ -33,8 +33,9 @@ from a2tg_jax.base.text import in_bytes
 from a2tg_jax.cli.main import main
 from a2tg_jax.results import page_export
 from a2tg_jax.results.compression import loss_measures
-from a2tg_jax.results.meshing import MeshOptions, write_mesh
+from a2tg_jax.results.meshing import write_mesh
 from a2tg_jax.results.model_source import Source, open_source
+from a2tg_jax.results.options import MeshOptions
 from a2tg_jax.results.page_export import export_comparison, export_web
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record
 from a2tg_jax.results.viewing import CameraPhotographs, routes_of

@@ -6,6 +6,7 @@ import inspect
 import os
 import types
 import typing
+import webbrowser
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -22,7 +23,9 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
+from a2tg_jax.base.operating_system import has_display
 from a2tg_jax.base.regular_files import expanded
+from a2tg_jax.results.folder import open_run
 
 Parsed = TypeVar("Parsed")
 
@@ -31,6 +34,7 @@ FLAGS: dict[type, Mapping[str, tuple[Any, ...]]] = {}
 """Annotations for tyro of the fields of classes outside the command line; modules of commands add them."""
 
 
+SCENE_IS_MISSING = "SCENE is missing: a folder, or built in, synthetic or cells: a2tg train SCENE --out RUN"
 print_now = functools.partial(print, flush=True)
 """Print a line that is read while the program works."""
 
@@ -80,15 +84,48 @@ def parse(kind: type[Parsed], program: str, arguments: Sequence[str], default: P
     rules.primitive_rule(_optional_rule)
     rules.struct_rule(_dataclass_rule)
     about = inspect.getdoc(kind) or ""
-    given: dict[str, Any] = {}
-    if default is not None:
-        about = about.split("\n")[0]  # The other lines are the short help.
-        given["default"] = default
+    given: dict[str, Any] = {} if default is None else {"default": default}
     command: Parsed = tyro.cli(kind, prog=program, args=arguments, description=about, registry=rules, **given)
     for word in arguments:
         # Raises ValueError for a URL, which would name a folder of this machine.
         expanded(word.partition("=")[2] if word.startswith("--") else word)
     return command
+
+
+@dataclasses.dataclass(frozen=True)
+class DecidingOptions:
+    """Options that determine the defaults of the others."""
+
+    config: str = ""
+    system: str = ""
+    preset: str = ""
+    out: str = ""
+    coordinator: str = ""
+    resume: bool = False
+    overwrite: bool = False
+
+    @property
+    def takes_run(self) -> bool:
+        """Whether the defaults are the options of the run to resume."""
+        return bool(self.out) and self.resume and not self.overwrite
+
+
+def deciding_options(arguments: Sequence[str]) -> DecidingOptions:
+    """Return the options of `a2tg train` that determine the defaults of the others.
+
+    Raises:
+      ValueError, FileNotFoundError: if there are no arguments, a path is a URL, or there is no run to resume.
+    """
+    if not arguments:
+        raise ValueError(SCENE_IS_MISSING)
+    given, _ = tyro.cli(DecidingOptions, prog="a2tg train", args=arguments, return_unknown_args=True, add_help=False)
+    for path in (given.config, given.out):
+        expanded(path)  # Raises ValueError for a URL.
+    if given.resume and given.config:
+        raise ValueError("--resume takes every option from the run folder: leave out --config")
+    if given.takes_run:
+        open_run(Path(given.out))
+    return given
 
 
 def at_home(word: str) -> str:
@@ -160,3 +197,9 @@ def _optional_rule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | N
         str_from_instance=lambda value: ["None"] if value is None else plain.str_from_instance(value),
         choices=None if plain.choices is None else (*plain.choices, "None"),
     )
+
+
+def open_browser(address: str) -> None:
+    """Open a page if the machine has a display."""
+    if has_display():
+        webbrowser.open(address)

@@ -1,6 +1,5 @@
 """`a2tg doctor`: what this machine computes with, and whether all its compositors agree."""
 
-import dataclasses
 import os
 import platform
 import time
@@ -25,41 +24,35 @@ HEIGHT = 64
 NUM = 400
 
 
-@dataclasses.dataclass(frozen=True)
-class Doctor:
-    """Print what this machine computes with, and compare images and gradients of all compositors.
-
-    Include the output when you report a problem.
-    """
-
-    def run(self) -> None:
-        device = jax.devices()[0]
-        cuda = cuda_of_driver()
-        wanted = os.environ.get(VARIABLE)
-        # As JAX names it when it compiles; a device calls both CUDA and ROCm "gpu".
-        of_jax = "cuda" if "cuda" in device.client.platform_version.lower() else device.platform
-        kinds = ["the CPU" if one.platform == "cpu" else f"{one.platform} ({one.device_kind})" for one in jax.devices()]
-        machine = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
-        lines = {
-            "a2tg-jax": f"{version('a2tg-jax')}, {machine}",
-            "packages": ", ".join(f"{name} {_version(name)}" for name in PACKAGES),
-            "devices": ", ".join(kinds),
-            "driver": f"NVIDIA's, for CUDA {cuda[0]}.{cuda[1]}" if cuda else "no NVIDIA driver is found",
-            "threads": f"{num_threads()} ({f'{VARIABLE}={wanted}' if wanted else f'{VARIABLE} is not set'})",
-            "memory": f"{memory_limit() / 1e9:.1f} GB may be used",
-            "XLA_FLAGS": os.environ.get("XLA_FLAGS") or "not set",
-            "cache": str(compilation_cache_folder()),
-            "compositor": f"{platforms.choose('auto', of_jax)} is the choice of 'auto'",
-        }
-        for name, text in lines.items():
-            _print(name, text)
-        missing = {name: text for name, text in platforms.REMEDIES.items() if not platforms.is_available(name, of_jax)}
-        for name, remedy in missing.items():
-            _print("", f"{name} is not available: it needs {remedy}")
-        largest = _compare([name for name in platforms.PLATFORMS if platforms.is_available(name, of_jax)])
-        if not largest <= MOST_DIFFERENCE:
-            raise ValueError(f"the compositors differ by {largest:.2g}; please report this with the lines above")
-        _print("verdict", _verdict(of_jax, missing, has_driver=cuda is not None))
+def diagnose() -> None:
+    """Print what this machine computes with. Raises ValueError if its compositors differ."""
+    device = jax.devices()[0]
+    cuda = cuda_of_driver()
+    wanted = os.environ.get(VARIABLE)
+    # As JAX names it when it compiles; a device calls both CUDA and ROCm "gpu".
+    of_jax = "cuda" if "cuda" in device.client.platform_version.lower() else device.platform
+    kinds = ["the CPU" if one.platform == "cpu" else f"{one.platform} ({one.device_kind})" for one in jax.devices()]
+    machine = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
+    lines = {
+        "a2tg-jax": f"{version('a2tg-jax')}, {machine}",
+        "packages": ", ".join(f"{name} {_version(name)}" for name in PACKAGES),
+        "devices": ", ".join(kinds),
+        "driver": f"NVIDIA's, for CUDA {cuda[0]}.{cuda[1]}" if cuda else "no NVIDIA driver is found",
+        "threads": f"{num_threads()} ({f'{VARIABLE}={wanted}' if wanted else f'{VARIABLE} is not set'})",
+        "memory": f"{memory_limit() / 1e9:.1f} GB may be used",
+        "XLA_FLAGS": os.environ.get("XLA_FLAGS") or "not set",
+        "cache": str(compilation_cache_folder()),
+        "compositor": f"{platforms.choose('auto', of_jax)} is the choice of 'auto'",
+    }
+    for name, text in lines.items():
+        _print(name, text)
+    missing = {name: text for name, text in platforms.REMEDIES.items() if not platforms.is_available(name, of_jax)}
+    for name, remedy in missing.items():
+        _print("", f"{name} is not available: it needs {remedy}")
+    largest = _compare([name for name in platforms.PLATFORMS if platforms.is_available(name, of_jax)])
+    if not largest <= MOST_DIFFERENCE:
+        raise ValueError(f"the compositors differ by {largest:.2g}; please report this with the lines above")
+    _print("verdict", _verdict(of_jax, missing, has_driver=cuda is not None))
 
 
 def _verdict(platform: str, missing: Mapping[Compositor, str], *, has_driver: bool) -> str:

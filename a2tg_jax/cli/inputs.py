@@ -10,13 +10,7 @@ from tyro.conf import Positional, arg
 from a2tg_jax.base.text import did_you_mean
 from a2tg_jax.cli.arguments import defaulting_to, print_now
 from a2tg_jax.data.download import BENCHMARK_SETS, fetch
-from a2tg_jax.data.load import is_scene
-from a2tg_jax.data.photo_folder import CAMERA_PICTURE, holds_photos
-from a2tg_jax.data.sfm import CameraModel, Matching, run_sfm
-from a2tg_jax.data.staging import Panorama
-from a2tg_jax.data.video import DEFAULT_FRAMES
-from a2tg_jax.results.commands import quick_flags
-from a2tg_jax.results.figures import save_camera_picture
+from a2tg_jax.data.sfm_options import DEFAULT_FRAMES, CameraModel, Matching, Panorama
 from a2tg_jax.results.output_paths import check_apart, check_output
 
 
@@ -58,6 +52,12 @@ class Sfm:
     """Lens to estimate. OPENCV suits wide lenses, OPENCV_FISHEYE action cameras such as GoPro's."""
 
     def run(self) -> None:
+        from a2tg_jax.data.load import is_scene
+        from a2tg_jax.data.photo_folder import CAMERA_PICTURE
+        from a2tg_jax.data.sfm import run_sfm
+        from a2tg_jax.results.commands import quick_flags
+        from a2tg_jax.results.figures import save_camera_picture
+
         sources, out = self._places()
         if self.masks is not None:
             check_apart(out, self.masks)
@@ -87,6 +87,8 @@ class Sfm:
 
     def _places(self) -> tuple[list[Path], Path]:
         """Return the sources and the scene folder."""
+        from a2tg_jax.data.photo_folder import holds_photos
+
         if not self.sources:
             raise ValueError("PHOTOS is missing: a folder of photographs, photographs, or a video")
         if self.out is not None:

@@ -1,8 +1,8 @@
-"""The command line `a2tg`. Commands are imported when they run, so that help and a mistyped name need no JAX."""
+"""The command line `a2tg`. What commands work with is imported when they run, so that help, a mistyped word and a
+missing path need no JAX."""
 
 import contextlib
 import importlib
-import inspect
 import os
 import re
 import sys
@@ -12,6 +12,7 @@ from importlib.metadata import version
 from typing import Any
 
 from a2tg_jax.base.machine import check_ulimits
+from a2tg_jax.base.regular_files import expanded
 from a2tg_jax.base.text import did_you_mean, shortened
 from a2tg_jax.host import signals
 from a2tg_jax.host.errors import error_text
@@ -25,6 +26,7 @@ OVERVIEW = """usage: a2tg COMMAND [OPTIONS]
 Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textured scene.
 
   a2tg demo                            train a built-in scene, about a minute on two cores
+  a2tg make photos/ --minutes 10       a page from photographs or a video, by the commands below
   a2tg sfm photos/ scene/              find camera poses for photographs or a video with COLMAP
   a2tg download --list                 benchmark data sets that can be downloaded
   a2tg train scene/ --out runs/scene --preset quick --downscale 4
@@ -46,15 +48,54 @@ Run a2tg COMMAND --help for a command, a2tg train --system NAME --help-all for t
 and a2tg --version for the version. The systems: bytewise, a2tg, gaussians-2d,
 gaussians-2d-mcmc, textured-gaussians, supergaussians, bbsplat.
 Set A2TG_DEBUG=1 to see the traceback of an error."""
+TRAIN_HELP = """usage: a2tg train SCENE --out RUN [OPTIONS]
+
+Train a scene, evaluate the model and write a report.
+
+  SCENE                  scene folder with photographs and cameras, or built in: "synthetic", "cells"
+  --out RUN              run folder for models, checkpoints, metrics, pictures and report.html
+  --system NAME          method: bytewise (default; the best picture for its bytes), a2tg (the paper's), ...
+  --preset NAME          paper (default), quick (minutes on two cores) or smoke (half a minute)
+  --downscale K          divide the width and height of the photographs by K
+  --memory-budget SIZE   cap the model's size in memory during training, such as 20MB
+  --file-budget SIZE     write a compact file of at most this size, such as 60kB, when training is over
+  --baseline             train plain Gaussians as well, and compare
+  --compare NAME         train another system as well, and compare; may be repeated
+  --view                 show the training in a browser, where you can pause it
+  --max-memory SIZE      memory limit of the process and the GPU, such as 8GB
+  --config FILE          take options from a file, such as run.toml of another run
+  --resume               continue from the newest checkpoint in the run folder
+  --resume --more N      train a finished run on, for N more iterations of the last stage
+  --overwrite            replace an earlier run in that folder
+  --yes                  train without a question about tiny photographs, or tiny or huge budgets
+  --quiet                hide the progress of training
+
+a2tg train --help-all lists every option by group, with its default; add --system NAME for the options of another
+system, --preset NAME for the defaults of a preset. Flags take precedence over --config.
+
+Checkpoints are written after every tenth of a stage, at least every 500 iterations, and on Ctrl-C or SIGTERM. The
+newest two are kept until the stage is finished.
+
+Examples:
+  a2tg train scenes/fox --out runs/fox --preset quick --downscale 2
+  a2tg train --out runs/fox --resume
+  a2tg train scenes/fox --out runs/small --memory-budget 20MB --baseline
+  a2tg train synthetic --out runs/three --preset smoke --compare textured-gaussians --compare bbsplat
+  a2tg train --config runs/fox/run.toml --out runs/again"""
 COMMANDS = {
-    "demo": "train:Demo", "train": "train:Train", "eval": "runs:Eval", "finish": "runs:Finish", "render": "runs:Render",
-    "mesh": "runs:MeshCommand", "view": "runs:ViewCommand", "export": "runs:Export", "convert": "runs:Convert",
-    "edit": "runs:EditCommand", "compare": "runs:Compare", "compress": "runs:Compress", "info": "runs:Info",
-    "sfm": "inputs:Sfm", "download": "inputs:Download", "doctor": "doctor:Doctor",
+    "demo": "first_steps:Demo", "make": "make:Make", "train": "train:Train", "eval": "runs:Eval",
+    "finish": "runs:Finish", "render": "runs:Render", "mesh": "runs:MeshCommand", "view": "runs:ViewCommand",
+    "export": "runs:Export", "convert": "runs:Convert", "edit": "runs:EditCommand", "compare": "runs:Compare",
+    "compress": "runs:Compress", "info": "runs:Info", "sfm": "inputs:Sfm", "download": "inputs:Download",
+    "doctor": "first_steps:Doctor",
 }  # fmt: skip
 """Module of `a2tg_jax.cli` and dataclass of each command."""
 WITHOUT_JAX = frozenset({"sfm", "download"})
 """Commands that do not start JAX."""
+WITHOUT_PATH = frozenset({"demo", "download", "doctor"})
+"""Commands whose first argument is no path."""
+BUILT_IN = frozenset({"synthetic", "cells"})
+"""Built-in scenes of `a2tg train`."""
 HELP = frozenset({"-h", "--help", "--help-all"})
 SMALLER = {
     "train": "close other programs, or give a larger --downscale, or a smaller --memory-budget or --batch-size",
@@ -113,31 +154,46 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(name: str, arguments: Sequence[str]) -> int:
     """Run a command of `COMMANDS` and return its exit code."""
-    if name not in WITHOUT_JAX and HELP.isdisjoint(arguments):
+    asks_for_help = not HELP.isdisjoint(arguments)
+    if name not in WITHOUT_JAX and not asks_for_help:
         check_ulimits()
-    configure_cpu()
     try:
         here = os.getcwd()
     except FileNotFoundError:
         raise ValueError("the current folder was deleted: change to one that exists") from None
     if here not in sys.path:  # Custom systems are modules there. At the end, it hides no other module.
         sys.path.append(here)
+    if not asks_for_help:
+        _check_first_path(name, arguments)
     if name == "train" and {"-h", "--help"} & set(arguments):
         return _print_help_of_train(arguments)
     try:
         command = parsed(name, arguments)
     except SystemExit as end:  # tyro has printed help, or an error.
         return int(end.code or 0)
+    if name not in WITHOUT_JAX:
+        configure_cpu()
     command.run()
     return 0
 
 
-def _print_help_of_train(arguments: Sequence[str]) -> int:
-    from a2tg_jax.cli.train import Train, defaults_line
+def _check_first_path(name: str, arguments: Sequence[str]) -> None:
+    """Raise FileNotFoundError if a command begins with a path that is missing, before JAX is imported."""
+    if name in WITHOUT_PATH or not arguments or arguments[0].startswith("-"):
+        return
+    if not expanded(arguments[0]).exists() and not (name == "train" and arguments[0] in BUILT_IN):
+        raise FileNotFoundError(f"{arguments[0]}: no such file or folder")
 
-    print(f"usage: a2tg train SCENE --out RUN [OPTIONS]\n\n{inspect.getdoc(Train)}")
+
+def _print_help_of_train(arguments: Sequence[str]) -> int:
+    from a2tg_jax.cli.arguments import deciding_options
+
+    print(TRAIN_HELP, flush=True)  # Before the import of JAX, which the defaults need.
     with contextlib.suppress(ValueError, OSError, SystemExit):  # Help also with a wrong system or file.
-        print(f"\n{defaults_line(arguments)}")
+        given = deciding_options(arguments)
+        from a2tg_jax.cli.train import defaults_line
+
+        print(f"\n{defaults_line(given)}")
     return 0
 
 
@@ -159,17 +215,18 @@ def parsed(name: str, arguments: Sequence[str]) -> Any:
       SystemExit: after help or an error of an argument, which are printed.
       ValueError, FileNotFoundError: if there is no such system, preset or file, or it is invalid.
     """
-    from a2tg_jax.cli.arguments import at_home, parse
+    from a2tg_jax.cli.arguments import at_home, deciding_options, parse
 
     arguments = [at_home(word) for word in arguments]
-    kind = command_class(name)
     program = f"a2tg {name}"
     words = ["--help" if word == "--help-all" else word for word in arguments]
     if name != "train":
-        return parse(kind, program, words)
-    from a2tg_jax.cli.train import train_defaults
+        return parse(command_class(name), program, words)
+    given = deciding_options(arguments)
+    configure_cpu()  # Custom systems may compute when they are imported.
+    from a2tg_jax.cli.train import Train, train_defaults
 
-    return parse(kind, program, words, train_defaults(arguments))
+    return parse(Train, program, words, train_defaults(given))
 
 
 def _fail(message: str) -> int:

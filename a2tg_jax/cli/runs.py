@@ -1,5 +1,8 @@
 """The commands for finished runs and models: `a2tg eval`, `finish`, `render`, `mesh`, `view`, `export`, `convert`,
-`compress` and `info`."""
+`compress` and `info`.
+
+Each imports what it works with when it runs: JAX takes a second, which a mistyped option should not cost.
+"""
 
 import dataclasses
 from pathlib import Path
@@ -7,7 +10,6 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from a2tg_jax.base.regular_files import is_regular
 from a2tg_jax.base.text import counted
 from a2tg_jax.cli.arguments import (
     FLAGS,
@@ -17,35 +19,23 @@ from a2tg_jax.cli.arguments import (
     RunFolderPath,
     RunOrFile,
     defaulting_to,
+    open_browser,
     print_now,
 )
-from a2tg_jax.cli.train import open_browser, print_result
-from a2tg_jax.io.formats import splats_at
-from a2tg_jax.mesh.files import mesh_files
-from a2tg_jax.results.compression import MAX_LOSS, CompressOptions, compress
-from a2tg_jax.results.conversion import BakeOptions, PlacementOptions, convert
-from a2tg_jax.results.editing import EditOptions, write_edit
-from a2tg_jax.results.finish_record import FinishOptions
-from a2tg_jax.results.finishing import finish_run
 from a2tg_jax.results.folder import RunFolder, json_text, open_run, opened, runs_in
-from a2tg_jax.results.frames import (
+from a2tg_jax.results.options import (
     FRAMES_PER_SECOND,
-    FrameFolder,
-    Route,
-    check_rate,
-    parse_size,
-    render_frames,
-    video_name,
-    write_video,
+    MAX_LOSS,
+    TEXTURED_FACES,
+    BakeOptions,
+    CameraPath,
+    CompressOptions,
+    EditOptions,
+    FinishOptions,
+    MeshOptions,
+    PlacementOptions,
 )
-from a2tg_jax.results.info import describe_file, describe_run, describe_runs, facts_or_damage, file_facts, run_facts
-from a2tg_jax.results.meshing import TEXTURED_FACES, MeshOptions, write_mesh
-from a2tg_jax.results.model_source import open_source
 from a2tg_jax.results.output_paths import check_apart, check_export, check_not_source, check_output
-from a2tg_jax.results.page_export import check_page, export_comparison, export_web
-from a2tg_jax.results.report import metrics_json
-from a2tg_jax.results.run_evaluation import check_weights, evaluate_run
-from a2tg_jax.results.viewing import routes_of
 from a2tg_jax.web.server import LOOPBACK, serve
 
 FLAGS[CompressOptions] = {
@@ -84,6 +74,10 @@ class Eval:
     """Print metrics.json, for programs, instead of a table."""
 
     def run(self) -> None:
+        from a2tg_jax.cli.training import print_result
+        from a2tg_jax.results.report import metrics_json
+        from a2tg_jax.results.run_evaluation import check_weights, evaluate_run
+
         check_weights(self.lpips_weights)
         with opened(self.folder) as run:
             result = evaluate_run(run, lpips_weights=self.lpips_weights)
@@ -111,6 +105,9 @@ class Finish:
     lpips_weights: LpipsWeights = None
 
     def run(self) -> None:
+        from a2tg_jax.results.finishing import finish_run
+        from a2tg_jax.results.run_evaluation import check_weights
+
         check_weights(self.lpips_weights)
         check_apart(self.out, self.folder)
         check_output(self.out)
@@ -134,7 +131,7 @@ class Render:
     """
 
     folder: RunFolderPath
-    path: Route | Path = "smooth"
+    path: CameraPath | Path = "smooth"
     """Camera path: smooth (a flight past the cameras), orbit (a turntable around the subject), test (the test views),
     or a file (*.json) saved in a2tg view."""
     frames: int = 120
@@ -159,6 +156,8 @@ class Render:
     """Replace files that exist. Files of earlier renders are always replaced, and frames of a longer flight deleted."""
 
     def run(self) -> None:
+        from a2tg_jax.results.frames import FrameFolder, check_rate, parse_size, render_frames, video_name, write_video
+
         run = open_run(self.folder)
         out = self.out or run.path / "frames"
         check_rate(self.fps)
@@ -216,10 +215,14 @@ class MeshCommand:
     """Replace files that exist. A run's mesh.glb, once a2tg mesh has written it, is always replaced."""
 
     def run(self) -> None:
+        from a2tg_jax.mesh.files import mesh_files
+        from a2tg_jax.results.meshing import check_options, write_mesh
+        from a2tg_jax.results.model_source import open_source
+
         is_run = self.source.is_dir()
         default = self.source / "mesh.glb" if is_run else self.source.with_name(f"{self.source.stem}-mesh.glb")
         out = self.out or default
-        self.options.check(out)
+        check_options(self.options, out)
         files = mesh_files(out, has_texture=self.options.texture != "none")
         check_not_source(files, self.source, "--out")
         source = open_source(self.source, self.model, self.edit)
@@ -257,6 +260,9 @@ class ViewCommand:
     """Open a browser if the machine has a display."""
 
     def run(self) -> None:
+        from a2tg_jax.results.model_source import open_source
+        from a2tg_jax.results.viewing import routes_of
+
         source = open_source(self.source, self.model, self.edit)
         serve(routes_of(source), host=self.host, port=self.port, on_start=self._started)
 
@@ -293,6 +299,9 @@ class Export:
     """Replace the page if it exists."""
 
     def run(self) -> None:
+        from a2tg_jax.results.model_source import open_source
+        from a2tg_jax.results.page_export import check_page, export_web
+
         page = {"single_file": self.single_file, "photographs": self.photographs, "overwrite": self.overwrite}
         check_output(self.web)
         check_not_source(check_page(self.web, **page), self.source, "--web")
@@ -317,6 +326,9 @@ class Compare:
     """Replace the output file."""
 
     def run(self) -> None:
+        from a2tg_jax.results.model_source import open_source
+        from a2tg_jax.results.page_export import export_comparison
+
         check_output(self.out)
         sources = [open_source(self.first), open_source(self.second)]
         print(export_comparison(sources, self.out, overwrite=self.overwrite))
@@ -351,6 +363,8 @@ class Convert:
     """Replace the output file."""
 
     def run(self) -> None:
+        from a2tg_jax.results.conversion import convert
+
         print(
             convert(
                 self.source,
@@ -385,6 +399,8 @@ class EditCommand:
     """Replace the output file."""
 
     def run(self) -> None:
+        from a2tg_jax.results.editing import write_edit
+
         print(write_edit(self.source, self.out, self.options, self.model, overwrite=self.overwrite))
 
 
@@ -414,6 +430,8 @@ class Compress:
     """Print a table of the loss and the bytes of each choice of bits."""
 
     def run(self) -> None:
+        from a2tg_jax.results.compression import compress
+
         print(
             compress(
                 self.source, self.out, self.options, overwrite=self.overwrite, verbose=self.verbose, on_note=print_now
@@ -437,15 +455,17 @@ class Info:
     """Print JSON, for programs."""
 
     def run(self) -> None:
+        from a2tg_jax.base.regular_files import is_regular
+        from a2tg_jax.io.formats import splats_at
+        from a2tg_jax.results import info
+
         path = splats_at(self.folder)
         if is_regular(path):
-            print(json_text(file_facts(path)) if self.json else describe_file(path))
+            print(json_text(info.file_facts(path)) if self.json else info.describe_file(path))
             return
-        if not self.folder.exists():
-            raise FileNotFoundError(f"{self.folder}: no such file or folder")
         runs = [] if RunFolder(self.folder).record.is_file() else runs_in(self.folder)
         if runs:
-            print(json_text([facts_or_damage(run) for run in runs]) if self.json else describe_runs(runs))
+            print(json_text([info.facts_or_damage(run) for run in runs]) if self.json else info.describe_runs(runs))
             return
         run = open_run(self.folder)
-        print(json_text(run_facts(run)) if self.json else describe_run(run))
+        print(json_text(info.run_facts(run)) if self.json else info.describe_run(run))

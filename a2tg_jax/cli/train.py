@@ -1,33 +1,22 @@
-"""The commands that train: `a2tg demo` and `a2tg train`."""
+"""Arguments of `a2tg train`, whose options are the ones of its system."""
 
 import contextlib
 import dataclasses
 import math
 import re
-import sys
-import webbrowser
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Annotated
 
-import jax
 import tyro
 from tyro.conf import Fixed, Positional, Suppress, UseAppendAction, arg
 
-from a2tg_jax import A2tg, Mcmc, Scene, Session, Upscale
 from a2tg_jax.base.config_json import flatten_config
-from a2tg_jax.base.machine import tidy_memory
-from a2tg_jax.base.operating_system import has_display
-from a2tg_jax.base.regular_files import expanded
-from a2tg_jax.base.text import budget_in_bytes, counted
-from a2tg_jax.cli.arguments import FLAGS, LpipsWeights, defaulting_to, print_now
+from a2tg_jax.base.text import budget_in_bytes
+from a2tg_jax.cli.arguments import FLAGS, SCENE_IS_MISSING, DecidingOptions, LpipsWeights, defaulting_to, print_now
 from a2tg_jax.cli.processes import AUTO, ProcessPlace, joined
 from a2tg_jax.data.load import SceneSource
 from a2tg_jax.results.commands import file_command, resuming_command
 from a2tg_jax.results.folder import RunFolder, open_run, opened
-from a2tg_jax.results.forecast import room_for_photographs
-from a2tg_jax.results.history import tensorboard_library
 from a2tg_jax.results.record import (
     RunRecord,
     contradictions,
@@ -36,10 +25,6 @@ from a2tg_jax.results.record import (
     read_run_file,
     write_record,
 )
-from a2tg_jax.results.report import RunResult, sizes_line, summary_text
-from a2tg_jax.results.run_processes import check_batch_sizes, follow_first_process
-from a2tg_jax.results.run_training import RunOptions, begin_run, resume_run, unseen, warn
-from a2tg_jax.results.viewing import LiveView, shown_live
 
 FLAGS[SceneSource] = {"path": (Positional, arg(metavar="SCENE", help_behavior_hint="(required)"))}
 FLAGS[RunRecord] = {
@@ -53,88 +38,17 @@ FLAGS[RunRecord] = {
     "compare_options": (Fixed, Suppress),
 }
 BASELINE = "gaussians-2d-mcmc"
-SCENE_IS_MISSING = "SCENE is missing: a folder, or built in, synthetic or cells: a2tg train SCENE --out RUN"
 HEARTBEAT_TIMEOUT = 60.0
 """Default of --heartbeat-timeout-seconds."""
 ADDRESS = re.compile(r"(\[[0-9A-Fa-f:.]+(%[\w.-]+)?\]|[^:\[\]]+):\d+")
 """HOST:PORT, with IPv6 addresses in brackets."""
 IMPORTANT = ("stage1_iterations", "stage2_iterations", "densify.cap", "sh_degree")
 """Options whose defaults the short help shows."""
-DEMO_SYSTEM = A2tg(
-    stage1_iterations=400,
-    stage2_iterations=250,
-    densify=Mcmc(cap=1_500),
-    texture=Upscale(fraction=0.5, at=(0.1, 0.2)),
-    texel_rate=1e-2,
-)
-"""With few iterations, textures must grow early and learn fast."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Demo:
-    """Train the built-in synthetic scene with and without textures.
-
-    Takes about a minute on two cores. Open runs/demo/report.html for the results.
-    """
-
-    out: Path = Path("runs/demo")
-    """Run folder."""
-    resume: bool = False
-    """Continue from the newest checkpoint in the run folder."""
-    overwrite: bool = False
-    """Replace an earlier run in that folder; it is kept until the new one has its report."""
-    quiet: bool = False
-    """Hide the progress of training, but not forecasts, warnings and results."""
-
-    def run(self) -> None:
-        options = RunOptions(
-            overwrite=self.overwrite,
-            session=Session(after_compiling=tidy_memory),
-            progress=not self.quiet,
-            on_note=print_now,
-        )
-        if self.resume:
-            resume(self.out, options)
-            return
-        record = RunRecord(SceneSource("synthetic"), A2tg.name, DEMO_SYSTEM, (BASELINE,))
-        print_result(begin_run(record, self.out, options), self.out)
 
 
 @dataclasses.dataclass(frozen=True)
 class Train:
-    """Train a scene, evaluate the model and write a report.
-
-      SCENE                  scene folder with photographs and cameras, or built in: "synthetic", "cells"
-      --out RUN              run folder for models, checkpoints, metrics, pictures and report.html
-      --system NAME          method: bytewise (default; the best picture for its bytes), a2tg (the paper's), ...
-      --preset NAME          paper (default), quick (minutes on two cores) or smoke (half a minute)
-      --downscale K          divide the width and height of the photographs by K
-      --memory-budget SIZE   cap the model's size in memory during training, such as 20MB
-      --file-budget SIZE     write a compact file of at most this size, such as 60kB, when training is over
-      --baseline             train plain Gaussians as well, and compare
-      --compare NAME         train another system as well, and compare; may be repeated
-      --view                 show the training in a browser, where you can pause it
-      --max-memory SIZE      memory limit of the process and the GPU, such as 8GB
-      --config FILE          take options from a file, such as run.toml of another run
-      --resume               continue from the newest checkpoint in the run folder
-      --resume --more N      train a finished run on, for N more iterations of the last stage
-      --overwrite            replace an earlier run in that folder
-      --yes                  train without a question about tiny photographs, or tiny or huge budgets
-      --quiet                hide the progress of training
-
-    a2tg train --help-all lists every option by group, with its default; add --system NAME for the options of another
-    system, --preset NAME for the defaults of a preset. Flags take precedence over --config.
-
-    Checkpoints are written after every tenth of a stage, at least every 500 iterations, and on Ctrl-C or SIGTERM. The
-    newest two are kept until the stage is finished.
-
-    Examples:
-      a2tg train scenes/fox --out runs/fox --preset quick --downscale 2
-      a2tg train --out runs/fox --resume
-      a2tg train scenes/fox --out runs/small --memory-budget 20MB --baseline
-      a2tg train synthetic --out runs/three --preset smoke --compare textured-gaussians --compare bbsplat
-      a2tg train --config runs/fox/run.toml --out runs/again
-    """
+    """Train a scene, evaluate the model and write a report."""
 
     record: Annotated[RunRecord, arg(name="")]
     out: Path
@@ -174,13 +88,25 @@ class Train:
     """Time without a sign of life after which a process counts as lost and the others stop, with --coordinator."""
 
     def run(self) -> None:
+        import jax
+
+        from a2tg_jax import Session
+        from a2tg_jax.base.machine import tidy_memory
+        from a2tg_jax.cli import training
+        from a2tg_jax.results.forecast import room_for_photographs
+        from a2tg_jax.results.history import tensorboard_library
+        from a2tg_jax.results.run_processes import check_batch_sizes, follow_first_process
+        from a2tg_jax.results.run_training import RunOptions, begin_run, unseen, warn
+
         if not self.record.scene.path:
             raise ValueError(SCENE_IS_MISSING)
         # Processes must join before anything starts the devices of JAX.
         with joined(self.place, lambda: f"continue with: {resuming_command(RunFolder(self.out))}"):
-            session = Session(after_compiling=tidy_memory, devices=devices_named(self.devices))
+            session = Session(after_compiling=tidy_memory, devices=training.devices_named(self.devices))
             most = budget_in_bytes(self.max_memory, "max_memory")
-            record = self.whole_record if self.resume else with_view_for_each(self.whole_record, session.num_devices)
+            record = self.whole_record
+            if not self.resume:
+                record = training.with_view_for_each(record, session.num_devices)
             check_batch_sizes(record, session)
             if jax.process_index() > 0:  # It trains with the first process and prints nothing.
                 record = self.resumed(open_run(self.out), is_first=False) if self.resume else record
@@ -194,17 +120,17 @@ class Train:
                 max_memory=most,
                 tensorboard=self.tensorboard,
                 progress=not self.quiet,
-                watched=in_browser if self.view else unseen,
+                watched=training.in_browser if self.view else unseen,
                 on_note=print_now,
-                confirm=warn if self.yes else ask,
+                confirm=warn if self.yes else training.ask,
                 session=session,
             )
             if self.resume:
-                resume(self.out, options, self.resumed)
+                training.resume(self.out, options, self.resumed)
             else:
                 if record.options.batch_size != self.record.options.batch_size:
                     print(f"{session.num_devices} devices: {record.options.batch_size} views a step (--batch-size)")
-                print_result(begin_run(record, self.out, options), self.out)
+                training.print_result(begin_run(record, self.out, options), self.out)
 
     @property
     def place(self) -> ProcessPlace | None:
@@ -283,34 +209,14 @@ class Train:
         return record
 
 
-@dataclasses.dataclass(frozen=True)
-class DecidingOptions:
-    """Options that determine the defaults of the others."""
-
-    config: str = ""
-    system: str = ""
-    preset: str = ""
-    out: str = ""
-    coordinator: str = ""
-    resume: bool = False
-    overwrite: bool = False
-
-
-def train_defaults(arguments: Sequence[str]) -> Train:
+def train_defaults(given: DecidingOptions) -> Train:
     """Return the command with the options of the configuration file, or of run.toml when a run is resumed.
 
     Raises:
       ValueError, FileNotFoundError: if there is no such system, preset, file or run, or it is invalid.
     """
-    if not arguments:
-        raise ValueError(SCENE_IS_MISSING)
-    given, _ = tyro.cli(DecidingOptions, prog="a2tg train", args=arguments, return_unknown_args=True, add_help=False)
-    for path in (given.config, given.out):
-        expanded(path)  # Raises ValueError for a URL.
-    if given.resume and given.config:
-        raise ValueError("--resume takes every option from the run folder: leave out --config")
     record = RunRecord(SceneSource())
-    if given.out and given.resume and not given.overwrite:
+    if given.takes_run:
         out = Path(given.out)
         # Several processes read the folder at once; the first one locks it later.
         with contextlib.nullcontext(open_run(out)) if given.coordinator else opened(out) as run:
@@ -324,84 +230,9 @@ def train_defaults(arguments: Sequence[str]) -> Train:
     return Train(record, tyro.MISSING)  # tyro requires what is MISSING.
 
 
-def defaults_line(arguments: Sequence[str]) -> str:
+def defaults_line(given: DecidingOptions) -> str:
     """Return the most important defaults of the given system and preset."""
-    record = train_defaults(arguments).record
+    record = train_defaults(given).record
     options = flatten_config(record.options)
     flags = [f"--{name.replace('_', '-')} {options[name]}" for name in IMPORTANT if name in options]
     return f"Defaults of {record.system} with the preset {record.preset or 'paper'}: {' '.join(flags)}"
-
-
-def resume(folder: Path, options: RunOptions, check: Callable[[RunFolder], object] = lambda run: None) -> None:
-    """Continue a run, once `check` has accepted it, and print its results.
-
-    Raises:
-      ValueError: if the run is to be replaced as well.
-    """
-    if options.overwrite:
-        raise ValueError("--resume continues a run and --overwrite replaces it: give one of them")
-    with opened(folder) as run:
-        check(run)
-        print_result(resume_run(run, options), folder)
-
-
-def ask(doubts: Sequence[str]) -> None:
-    """Ask on the terminal whether to train in spite of `doubts`. Raises ValueError if there is none, or the answer is
-    not yes."""
-    if not (sys.stdin.isatty() and sys.stderr.isatty()):
-        raise ValueError(f"{'; '.join(doubts)}; to train all the same, add `yes`")
-    warn(doubts)
-    print("Train all the same? [y/N] ", end="", file=sys.stderr, flush=True)
-    if sys.stdin.readline().strip().lower() not in ("y", "yes"):
-        raise ValueError("nothing was trained, as you answered")
-
-
-def with_view_for_each(record: RunRecord, num_devices: int) -> RunRecord:
-    """Return the record with as many views a step as there are devices, unless it has another number than one."""
-    if num_devices == 1 or record.options.batch_size > 1:
-        return record
-    return record.with_options(batch_size=num_devices)
-
-
-def devices_named(text: str) -> list[jax.Device] | None:
-    """Return the first N devices of each process, or all; None for one device of one process.
-
-    Raises:
-      ValueError: if the text is neither "all" nor a number from 1 to the number of devices.
-    """
-    devices: list[jax.Device] = jax.local_devices()
-    if text == "all":
-        text = str(len(devices))
-    if not text.isdecimal() or not 1 <= int(text) <= len(devices):
-        kind = devices[0].platform.upper()
-        raise ValueError(
-            f"--devices must be all, or a number from 1 to {len(devices)}; got {text!r}: this machine has "
-            f"{counted(len(devices), f'{kind} device')}"
-        )
-    # By process, so that all have the same list.
-    chosen: list[jax.Device] = []
-    for index in range(jax.process_count()):
-        chosen += jax.local_devices(process_index=index)[: int(text)]
-    return chosen if len(chosen) > 1 else None
-
-
-def print_result(result: RunResult, folder: Path) -> None:
-    """Print the metrics, the sizes and the path of the report."""
-    run = RunFolder(folder)
-    print(f"{summary_text(result)}\n{sizes_line(run, result)}\nreport: {run.report}")
-
-
-def in_browser(scene: Scene) -> AbstractContextManager[LiveView]:
-    """Show the training of a scene in a browser."""
-
-    def started(address: str) -> None:
-        print(f"{address} shows the training", flush=True)
-        open_browser(address)
-
-    return shown_live(scene, scene.name, started)
-
-
-def open_browser(address: str) -> None:
-    """Open a page if the machine has a display."""
-    if has_display():
-        webbrowser.open(address)

@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager, nullcontext, suppress
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -27,17 +27,10 @@ from a2tg_jax.data.image_files import map_in_threads
 from a2tg_jax.data.lenses import Lens
 from a2tg_jax.data.photo_folder import LEAST_PHOTOS
 from a2tg_jax.data.photo_reading import HALF, MASKS
-from a2tg_jax.data.staging import Panorama, Staged, directions, stage
-from a2tg_jax.data.video import DEFAULT_FRAMES
+from a2tg_jax.data.sfm_options import DEFAULT_FRAMES, CameraModel, Matching, Panorama
+from a2tg_jax.data.staging import Staged, directions, stage
 from a2tg_jax.host.progress_bars import clock, counting, ticking
 
-Matching = Literal["auto", "exhaustive", "sequential"]
-"""Pairs of photographs to match: all of them (exhaustive), neighbours by name (sequential), or by their number."""
-CameraModel = Literal[
-    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_RADIAL_FISHEYE",
-    "RADIAL_FISHEYE", "OPENCV_FISHEYE",
-]  # fmt: skip
-"""COLMAP's names of camera models that can be estimated from photographs."""
 MAX_EXHAUSTIVE = 200
 """Number of photographs beyond which "auto" matches only neighbours in name order."""
 MIN_REGISTERED = 3

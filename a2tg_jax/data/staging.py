@@ -12,7 +12,7 @@ import warnings
 from collections import Counter, defaultdict
 from collections.abc import Callable, Container, Iterable, Sequence
 from pathlib import Path, PurePosixPath
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -25,10 +25,9 @@ from a2tg_jax.data.lenses import sampled
 from a2tg_jax.data.panoramas import Projection, projection_of
 from a2tg_jax.data.photo_folder import LEAST_PHOTOS, find_photos, is_video
 from a2tg_jax.data.photo_reading import HALF, MASKS, mask_names, read_mask, warn_of_grey, warn_of_lacking_masks
+from a2tg_jax.data.sfm_options import Panorama
 from a2tg_jax.data.video import extract_frames
 
-Panorama = Literal["auto", "yes", "no"]
-"""Whether pictures twice as wide as high are panoramas: those that are recognised (auto), all of them, or none."""
 COLMAP_FORMATS = ("JPEG", "MPO", "PNG", "BMP")
 """Formats that COLMAP reads as Pillow does. TIFF is not among them: with some compressions COLMAP reads black."""
 COLMAP_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")

@@ -20,7 +20,6 @@ from a2tg_jax.host.errors import as_argument
 from a2tg_jax.host.optional import optional
 from a2tg_jax.host.progress_bars import counting
 
-DEFAULT_FRAMES = 150
 SHARPNESS_WIDTH = 640
 MOTION_WIDTH = 128
 """Widths in pixels of the greyscale frames on which sharpness and motion are measured."""

@@ -44,9 +44,6 @@ from a2tg_jax.host.training_bar import ProgressBar
 from a2tg_jax.model import plain_gaussians
 from a2tg_jax.texture import NEUTRAL_TEXEL
 
-MOST_GROWTH = 2.0
-"""Largest ratio of the bytes after baking to those before."""
-ITERATIONS = 500
 MOST_VIEWS = 12
 """Largest number of views, evenly chosen, for measuring where texels and spherical harmonics matter."""
 LEAST_ALPHA = 1 / 255
@@ -61,8 +58,8 @@ def bake(
     model: Model,
     cameras: Sequence[Camera],
     *,
-    growth: float = MOST_GROWTH,
-    iterations: int = ITERATIONS,
+    growth: float,
+    iterations: int,
     progress: bool = False,
 ) -> Model:
     """Return a plain model that looks like a textured one (host).

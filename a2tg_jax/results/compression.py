@@ -1,9 +1,7 @@
 """Compression of a model to the smallest compact file within a loss, or the best one within some bytes, with a table of
 the choices tried."""
 
-import dataclasses
 import functools
-import math
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
@@ -40,48 +38,14 @@ from a2tg_jax.io.formats import FORMATS
 from a2tg_jax.io.model_rows import check_encodable
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.model_source import open_source
+from a2tg_jax.results.options import CompressOptions
 from a2tg_jax.results.output_paths import check_export, check_output
 from a2tg_jax.results.report import aligned, loss_text
 from a2tg_jax.results.run_evaluation import refined_views
 
 SUFFIX = ".a2tgz"
-MAX_LOSS = 0.05
-"""Default of `max_loss`."""
 MOST_VIEWS = 16
 """Largest number of views of a kind, training or test, that are measured, evenly chosen."""
-
-
-@dataclasses.dataclass(frozen=True)
-class CompressOptions:
-    """Aim of a compression: a loss, or bytes."""
-
-    max_loss: float | None = None
-    """Largest loss of PSNR in dB."""
-    file_budget: float | str | None = None
-    """Largest size of the file, such as 60kB, instead of --max-loss."""
-    tune_iterations: int = 0
-    """Iterations of training with rounding, which makes up for fewer bits; 1000 is a good number. The model is
-    tuned up to 4 times, each time for other bits: first for bits that lose 0.5 dB, or twice --max-loss if that is more.
-    With --file-budget it is tuned until the file fits, mostly once. 0: numbers are only rounded."""
-
-    @property
-    def max_bytes(self) -> int | None:
-        """File budget in bytes; None without one. Raises ValueError if it is invalid."""
-        return budget_in_bytes(self.file_budget, "file_budget")
-
-    @property
-    def most_loss(self) -> float:
-        """Largest loss in dB."""
-        return MAX_LOSS if self.max_loss is None else self.max_loss
-
-    def check(self) -> None:
-        """Raise ValueError, naming the option, if one is invalid."""
-        if self.max_bytes is not None and self.max_loss is not None:
-            raise ValueError("max_loss and file_budget exclude each other: give one of them")
-        if not 0 <= self.most_loss < math.inf:
-            raise ValueError(f"max_loss must be at least 0 dB; got {self.most_loss}")
-        if self.tune_iterations < 0:
-            raise ValueError(f"tune_iterations must be at least 0; got {self.tune_iterations}")
 
 
 def compress(
@@ -120,7 +84,7 @@ def compress(
         hint = ", which is compressed already" if name.endswith(SUFFIX) else ""
         raise ValueError(f"a2tg compress reads a run folder or *.npz; got {shortened(str(source))}{hint}")
     options.check()
-    max_bytes = options.max_bytes
+    max_bytes = budget_in_bytes(options.file_budget, "file_budget")
     num_iterations = options.tune_iterations
     if out is not None and (out.is_dir() or out.suffix.lower() != SUFFIX):
         raise ValueError(f"out must be the path of a file that ends in {SUFFIX}; got {out}")

@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import math
 import os
 import time
 from importlib.metadata import version
@@ -13,7 +12,7 @@ from a2tg_jax.base.archive import read_archive_header
 from a2tg_jax.base.regular_files import is_regular, sha256_of
 from a2tg_jax.base.text import counted, in_bytes
 from a2tg_jax.core.numerics import evenly_chosen
-from a2tg_jax.finish.baking import ITERATIONS, MOST_GROWTH, MOST_VIEWS, bake, likeness, pictures
+from a2tg_jax.finish.baking import MOST_VIEWS, bake, likeness, pictures
 from a2tg_jax.io.formats import (
     file_bytes,
     files_of,
@@ -24,45 +23,14 @@ from a2tg_jax.io.formats import (
     unseen_elsewhere,
     writer_of,
 )
-from a2tg_jax.io.other_programs import World, world_line
+from a2tg_jax.io.other_programs import world_line
 from a2tg_jax.io.ply import save_ply
 from a2tg_jax.io.sog import HEADER
 from a2tg_jax.model_file import FORMAT
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.model_source import Source, open_source
+from a2tg_jax.results.options import BakeOptions, PlacementOptions
 from a2tg_jax.results.output_paths import check_new, check_output
-
-
-@dataclasses.dataclass(frozen=True)
-class BakeOptions:
-    """Baking of textured splats into plain ones."""
-
-    bake: bool = False
-    """Turn splats with textures, or with kernels of other shapes, into plain ones."""
-    bake_growth: float = MOST_GROWTH
-    """Largest ratio of the numbers' bytes after --bake to the bytes before."""
-    bake_iterations: int = ITERATIONS
-    """Iterations of training in --bake; each draws one view. 0 leaves training out."""
-
-    def check(self) -> None:
-        """Raise ValueError, naming the option, if one is out of range, or has no effect."""
-        if not self.bake and self != BakeOptions():
-            raise ValueError("`bake_growth` and `bake_iterations` have no effect without `bake`: add it")
-        if not 1 <= self.bake_growth < math.inf:
-            raise ValueError(f"bake_growth must be a finite number of at least 1; got {self.bake_growth}")
-        if self.bake_iterations < 0:
-            raise ValueError(f"bake_iterations must be at least 0; got {self.bake_iterations}")
-
-
-@dataclasses.dataclass(frozen=True)
-class PlacementOptions:
-    """Positions and axes in files for other programs."""
-
-    float64: bool = False
-    """Write the positions of a PLY as float64, so that map coordinates keep their precision."""
-    world: World = "upright"
-    """Axes of files of other programs. upright: turned until +y is down, as these programs expect; map coordinates are
-    kept. original: as the capture has them."""
 
 
 def convert(
@@ -71,8 +39,8 @@ def convert(
     name: str | None = None,
     *,
     edit: Path | None = None,
-    baking: BakeOptions = BakeOptions(),
-    placement: PlacementOptions = PlacementOptions(),
+    baking: BakeOptions,
+    placement: PlacementOptions,
     overwrite: bool = False,
 ) -> str:
     """Write a run's model `name`, or a file of any known format, in another suffix's format, and return a summary.
@@ -91,7 +59,7 @@ def convert(
 def check_conversion(
     source: Path,
     out: Path,
-    placement: PlacementOptions = PlacementOptions(),
+    placement: PlacementOptions,
     *,
     overwrite: bool = False,
 ) -> None:
@@ -121,7 +89,7 @@ def write_converted(
     model: Model,
     out: Path,
     start: float,
-    placement: PlacementOptions = PlacementOptions(),
+    placement: PlacementOptions,
 ) -> str:
     """Write a model that was read from a file, after `check_conversion`, and return a summary with the seconds since
     `start` (`time.perf_counter`). Other arguments as in `convert`."""

@@ -1,6 +1,5 @@
 """Edits without the viewer: crop, floaters, vertical and background from options, as the viewer saves them."""
 
-import dataclasses
 import re
 import time
 from pathlib import Path
@@ -14,6 +13,7 @@ from a2tg_jax.core.origin import Color
 from a2tg_jax.io.edit_file import Edit, apply_edit, crop_box, save_edit
 from a2tg_jax.results.conversion import check_conversion, write_converted
 from a2tg_jax.results.model_source import open_source
+from a2tg_jax.results.options import EditOptions, PlacementOptions
 from a2tg_jax.results.output_paths import check_new, check_output
 
 AXES = dict(zip("xyz", np.eye(3), strict=True))
@@ -21,35 +21,20 @@ AXES |= {f"-{name}": -axis for name, axis in AXES.items()}
 """Directions by their names on the command line."""
 
 
-@dataclasses.dataclass(frozen=True)
-class EditOptions:
-    """Changes to a model, with the percentages of the viewer's sliders."""
-
-    crop: tuple[str, str, str] | None = None
-    """Upright box to keep: from and to along width, depth and height, in percent of the largest box; 50 is the middle
-    of the scene, and 0 and 100 cut nothing. Such as 35:65 35:65 0:100."""
-    floaters: float = 0.0
-    """Strictness in percent with which floaters are removed; 0 removes none."""
-    upright: str | None = None
-    """The vertical: the name of a photograph that was held level, or an axis of the original world that is up, such as
-    y; write --upright=-y for one with a minus."""
-    background: str | None = None
-    """Colour behind the scene, such as white or #ff8000."""
-
-    def edit_of(self, model: Model) -> Edit:
-        """Return the edit of a model. Raises ValueError, naming the option, if one is invalid or none is given."""
-        if self == EditOptions():
-            raise ValueError("nothing to change: give `crop`, `floaters`, `upright` or `background`")
-        if not 0 <= self.floaters <= 100:
-            raise ValueError(f"`floaters` must be a percentage from 0 to 100; got {self.floaters:g}")
-        up = None if self.upright is None else _vertical(self.upright, model)
-        crop = None
-        if self.crop is not None:
-            low, high = np.array([_shares(text) for text in self.crop]).T
-            # Like the sliders, upright by the vertical that the edit leads to.
-            vertical = _origin_of(model).vertical if up is None else up
-            crop = crop_box(model, vertical, low, high)
-        return Edit(crop, self.floaters / 100, up, None if self.background is None else _color(self.background))
+def edit_of(options: EditOptions, model: Model) -> Edit:
+    """Return the edit of a model. Raises ValueError, naming the option, if one is invalid or none is given."""
+    if options == EditOptions():
+        raise ValueError("nothing to change: give `crop`, `floaters`, `upright` or `background`")
+    if not 0 <= options.floaters <= 100:
+        raise ValueError(f"`floaters` must be a percentage from 0 to 100; got {options.floaters:g}")
+    up = None if options.upright is None else _vertical(options.upright, model)
+    crop = None
+    if options.crop is not None:
+        low, high = np.array([_shares(text) for text in options.crop]).T
+        # Like the sliders, upright by the vertical that the edit leads to.
+        vertical = _origin_of(model).vertical if up is None else up
+        crop = crop_box(model, vertical, low, high)
+    return Edit(crop, options.floaters / 100, up, None if options.background is None else _color(options.background))
 
 
 def write_edit(
@@ -63,12 +48,12 @@ def write_edit(
         check_output(out)
         check_new(out, "`out`", overwrite=overwrite)
     else:
-        check_conversion(source, out, overwrite=overwrite)
+        check_conversion(source, out, PlacementOptions(), overwrite=overwrite)
     opened = open_source(source, name)
-    edit = options.edit_of(opened.model)
+    edit = edit_of(options, opened.model)
     edited = apply_edit(opened.model, edit)
     if not is_edit:
-        return write_converted(opened.path, edited, out, start)
+        return write_converted(opened.path, edited, out, start, PlacementOptions())
     save_edit(out, edit)
     return f"{out}: an edit that keeps {edited.num:,} of {opened.model.num:,} Gaussians; --edit {out} applies it"
 

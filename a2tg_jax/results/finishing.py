@@ -14,9 +14,9 @@ from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.finish.polishing import polish
 from a2tg_jax.finish.shrinking import can_shrink, shrink_textures
 from a2tg_jax.host.progress_bars import counting
-from a2tg_jax.results.finish_record import FinishOptions
 from a2tg_jax.results.folder import RunFolder, check_free, claimed, write_json
 from a2tg_jax.results.model_source import finished_stage, settings_of
+from a2tg_jax.results.options import FinishOptions
 from a2tg_jax.results.plan import PlannedStage
 from a2tg_jax.results.record import RunRecord, write_record
 from a2tg_jax.results.report import aligned

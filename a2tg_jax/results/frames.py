@@ -11,7 +11,7 @@ import shutil
 import subprocess
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Literal, get_args
+from typing import get_args
 
 import jax.numpy as jnp
 from PIL import Image
@@ -26,12 +26,11 @@ from a2tg_jax.io.path_file import load_views
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.images import picture_names, save_animation, to_uint8, write_png
 from a2tg_jax.results.model_source import open_source
+from a2tg_jax.results.options import FRAMES_PER_SECOND, CameraPath
 from a2tg_jax.results.output_paths import check_new
 
-Route = Literal["test", "smooth", "orbit"]
 FLIGHT_SIZE = (1280, 720)
 """Default width and height of the frames of flights, in pixels."""
-FRAMES_PER_SECOND = 30
 LARGEST_SIDE = 8192
 WEBP_QUALITY = 80
 LIST = ".a2tg-frames"
@@ -97,7 +96,7 @@ def render_frames(
     run: RunFolder,
     out: Path,
     *,
-    route: Route | Path = "smooth",
+    route: CameraPath | Path = "smooth",
     num_frames: int = 120,
     name: str | None = None,
     size: tuple[int, int] | None = None,
@@ -189,13 +188,13 @@ def _images(frames: Sequence[Path]) -> Iterator[Image.Image]:
             yield image
 
 
-def _cameras(model: Model, route: Route | Path, num_frames: int) -> dict[str, Camera]:
+def _cameras(model: Model, route: CameraPath | Path, num_frames: int) -> dict[str, Camera]:
     """Return cameras by the file names of their frames; frames of a path have the names that `write_video` expects."""
     if isinstance(route, Path):
         try:
             saved = load_views(route)
         except FileNotFoundError as error:
-            raise FileNotFoundError(f"{error}{did_you_mean(str(route), get_args(Route))}") from None
+            raise FileNotFoundError(f"{error}{did_you_mean(str(route), get_args(CameraPath))}") from None
         return _numbered(path_through(saved, num_frames))
     origin = model.origin
     if origin is None:

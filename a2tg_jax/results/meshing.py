@@ -1,10 +1,8 @@
 """Mesh of a run or a model, written as a file."""
 
-import dataclasses
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -12,66 +10,35 @@ from a2tg_jax import Origin, Renderer, view_image
 from a2tg_jax.base.machine import memory_limit
 from a2tg_jax.base.text import budget_in_bytes, counted, in_bytes
 from a2tg_jax.host.progress_bars import progress_over
-from a2tg_jax.mesh.extract import MOST_CLUSTERS, check_lengths, extract_mesh
+from a2tg_jax.mesh.extract import check_lengths, extract_mesh
 from a2tg_jax.mesh.files import check_mesh_suffix, save_mesh
 from a2tg_jax.mesh.texturing import Picture, check_texture, texture_mesh
 from a2tg_jax.mesh.triangles import check_simplifying, simplify_mesh
 from a2tg_jax.results.model_source import Source
+from a2tg_jax.results.options import MeshOptions
 
 GRID_SHARE = 0.5
 """Default share of the free memory for voxels."""
-TEXTURED_FACES = 100_000
-"""Default number of faces of a mesh with a texture."""
-TextureSource = Literal["none", "renders", "photographs"]
 
 
-@dataclasses.dataclass(frozen=True)
-class MeshOptions:
-    """Options of a mesh; lengths are in units of the original world."""
-
-    resolution: int | None = None
-    """Voxels along the radius."""
-    voxel: float | None = None
-    """Side of a voxel in units of the original world."""
-    radius: float | None = None
-    """Radius around the point that the cameras look at, in units of the original world."""
-    unbounded: bool = False
-    """Continue beyond the radius, with voxels that grow with the distance."""
-    clusters: int = MOST_CLUSTERS
-    """Largest number of connected parts to keep; smaller ones are floaters."""
-    faces: int | None = None
-    """Largest number of faces. Needs pip install 'a2tg-jax[mesh]'."""
-    texture: TextureSource = "none"
-    """Fill a texture atlas from renders or photographs of the training views (GLB and OBJ). Needs xatlas (pip install
-    'a2tg-jax[mesh]')."""
-    texture_size: int = 2048
-    """Side of the atlas in texels."""
-    max_memory: str | None = None
-    """Memory budget of the voxels, such as 4GB."""
-
-    @property
-    def most_faces(self) -> int | None:
-        """Largest number of faces, None without a limit."""
-        return TEXTURED_FACES if self.faces is None and self.texture != "none" else self.faces
-
-    def check(self, out: Path) -> None:
-        """Raise ValueError if an option is invalid or a library is missing, before any computation."""
-        check_mesh_suffix(out, "`out`")
-        check_lengths(self.resolution, self.voxel, self.radius)
-        if self.clusters < 1:
-            raise ValueError(f"clusters must be at least 1; got {self.clusters}")
-        wanted = budget_in_bytes(self.max_memory, "max_memory")
-        most = memory_limit()
-        if wanted is not None and wanted > most:
-            raise ValueError(f"max_memory must be at most {in_bytes(most)}, the free memory; got {self.max_memory}")
-        if self.texture != "none":
-            if out.suffix.lower() == ".ply":
-                raise ValueError("a PLY file holds no texture: choose `out` NAME.glb or NAME.obj, or `texture` none")
-            check_texture(self.texture_size)
-        elif self.texture_size != MeshOptions.texture_size:
-            raise ValueError("texture_size has no effect without a texture: add `texture` renders or photographs")
-        if self.most_faces is not None:
-            check_simplifying(self.most_faces)
+def check_options(options: MeshOptions, out: Path) -> None:
+    """Raise ValueError if an option is invalid or a library is missing, before any computation."""
+    check_mesh_suffix(out, "`out`")
+    check_lengths(options.resolution, options.voxel, options.radius)
+    if options.clusters < 1:
+        raise ValueError(f"clusters must be at least 1; got {options.clusters}")
+    wanted = budget_in_bytes(options.max_memory, "max_memory")
+    most = memory_limit()
+    if wanted is not None and wanted > most:
+        raise ValueError(f"max_memory must be at most {in_bytes(most)}, the free memory; got {options.max_memory}")
+    if options.texture != "none":
+        if out.suffix.lower() == ".ply":
+            raise ValueError("a PLY file holds no texture: choose `out` NAME.glb or NAME.obj, or `texture` none")
+        check_texture(options.texture_size)
+    elif options.texture_size != MeshOptions.texture_size:
+        raise ValueError("texture_size has no effect without a texture: add `texture` renders or photographs")
+    if options.most_faces is not None:
+        check_simplifying(options.most_faces)
 
 
 def write_mesh(

@@ -27,11 +27,12 @@ from a2tg_jax.host.training_bar import ProgressBar
 from a2tg_jax.io.formats import load_splats
 from a2tg_jax.model_file import number_in_file
 from a2tg_jax.results.commands import file_command, resuming_command
-from a2tg_jax.results.compression import SUFFIX, CompressOptions, compress
+from a2tg_jax.results.compression import SUFFIX, compress
 from a2tg_jax.results.folder import RunFolder, check_free, claimed, iteration_of, put_back_old, set_aside
 from a2tg_jax.results.forecast import checked_forecast, doubts_about, room_for_photographs, time_after
 from a2tg_jax.results.history import EventWriter, write_history
 from a2tg_jax.results.model_source import check_init, write_first_stage
+from a2tg_jax.results.options import CompressOptions
 from a2tg_jax.results.output_paths import check_apart, check_output
 from a2tg_jax.results.plan import PlannedStage
 from a2tg_jax.results.record import OnNan, RunRecord, is_finished, read_record, write_record

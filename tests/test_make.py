@@ -1,0 +1,89 @@
+"""`a2tg make`, from photographs to a page, and the training that fits into given minutes."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import a2tg_jax as a2tg
+from a2tg_jax.cli import main as cli, make
+from a2tg_jax.results.folder import RunFolder
+from a2tg_jax.results.minutes import Speed, TimedTraining, measured_speed, training_within
+from a2tg_jax.results.record import read_record
+
+SPEED = Speed(pixel_seconds=4e-7, compile_seconds=30)
+"""About two cores of a laptop."""
+
+
+@pytest.mark.parametrize("size", [(320, 240), (640, 480), (1000, 750), (250, 1000)])
+@pytest.mark.parametrize("downscale", [1, 4])
+@pytest.mark.parametrize("minutes", [3, 10, 60])
+def test_a_training_takes_the_minutes_that_are_given(size, downscale, minutes):
+    found = training_within(60 * minutes, SPEED, size, downscale)
+    assert found.seconds <= 60 * minutes
+    is_longest = found.iterations == 30_000 or (found.downscale == 1 and found.iterations > 3_000)
+    assert is_longest or found.seconds > 0.97 * 60 * minutes
+    assert found.width == size[0] * downscale // found.downscale
+    assert found.memory_budget == pytest.approx(4e-6 * found.width * found.height, rel=0.05)
+    flags = dict(zip(found.flags[::2], found.flags[1::2], strict=True))
+    assert int(flags["--stage1-iterations"]) + int(flags["--stage2-iterations"]) == found.iterations
+    assert flags["--downscale"] == str(found.downscale)
+
+
+def test_more_minutes_bring_more_pixels_and_more_iterations():
+    short, long = (training_within(60 * minutes, SPEED, (1000, 750), 4) for minutes in (4, 60))
+    assert long.downscale < short.downscale and long.iterations > short.iterations
+    assert long.memory_budget > short.memory_budget
+
+
+def test_too_few_minutes_are_refused_with_the_number_that_is_needed():
+    with pytest.raises(ValueError, match=r"minutes are too few: 0\.5 are left .* needs 1\.0 at least"):
+        training_within(30, SPEED, (1000, 750), 4)
+    assert training_within(1.1 * 60, SPEED, (1000, 750), 4).iterations >= 1_000
+    with pytest.raises(ValueError, match=r"0\.0 are left"):
+        training_within(-5, SPEED, (1000, 750), 4)
+
+
+def test_the_speed_is_of_a_gradient():
+    speed = measured_speed(a2tg.synthetic_scene(num_views=4, width=32, height=24))
+    assert 1e-9 < speed.pixel_seconds < 1e-2 and speed.compile_seconds > 0.1
+
+
+def write_scene(folder):
+    """Photographs of the built-in scene with their cameras, as OpenGL poses."""
+    scene = a2tg.synthetic_scene(num_views=6, width=64, height=48, num_points=200)
+    frames = []
+    for index, view in enumerate(scene.train):
+        name = f"images/{index}.png"
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(np.uint8(255 * np.asarray(a2tg.view_image(view)))).save(folder / name)
+        pose = np.linalg.inv(np.asarray(view.camera.viewmat)) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
+    K = np.asarray(scene.train[0].camera.K)
+    lens = {"fl_x": float(K[0, 0]), "fl_y": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2])}
+    (folder / "transforms.json").write_text(json.dumps({**lens, "w": 64, "h": 48, "frames": frames}))
+
+
+@pytest.mark.long
+@pytest.mark.filterwarnings("ignore:.*has no sparse points")
+def test_a_scene_becomes_a_page_by_printed_commands_and_the_same_command_continues(tmp_path, monkeypatch, capsys):
+    write_scene(tmp_path / "toy")
+    tiny = TimedTraining(1, 64, 48, iterations=30, memory_budget=0.06, seconds=60)
+    monkeypatch.setattr("a2tg_jax.results.minutes.choose_training", lambda scene, seconds: tiny)
+    monkeypatch.setattr(make, "NUM_FRAMES", 2)
+    words = ["make", str(tmp_path / "toy"), "--out", str(tmp_path / "out"), "--no-open"]
+    assert cli.main(words) == 0
+    printed = capsys.readouterr().out
+    assert re.findall(r"^\$ a2tg (\w+)", printed, flags=re.MULTILINE) == ["train", "export", "render"]
+    assert "64×48 pixels, 60.0 kB, 30 iterations" in printed
+    assert read_record(RunFolder(tmp_path / "out" / "run")).options.stage1_iterations == 20
+    for name in ("toy.html", "toy.png", "run/report.html"):
+        assert (tmp_path / "out" / name).is_file(), name
+    assert len(list((tmp_path / "out" / "turntable").glob("*.png"))) == 2
+
+    # The run exists: nothing is chosen or trained again.
+    monkeypatch.setattr("a2tg_jax.results.minutes.choose_training", None)
+    assert cli.main(words) == 0
+    assert re.findall(r"^\$ a2tg (\w+)", capsys.readouterr().out, flags=re.MULTILINE) == ["export", "render"]
