@@ -160,20 +160,7 @@ def given_model(start: Model, scene: Scene, system: System, index: int) -> Model
     stage = stages[index]
     degree = system.initial_sh_degree
     num = start.num
-    if num < LEAST_LEFT:
-        raise ValueError(f"start must have at least {LEAST_LEFT} Gaussians; got {num}")
-    if index == 0:
-        system.check_initial_number(num)
-    elif system.memory_budget is not None:
-        system.check_given_number(num)
-    for event in stage.events:
-        most = event.most_gaussians
-        if index == 0 and most is not None and num > most:
-            limit = _limit_of(event, system)
-            raise ValueError(
-                f"start must have at most {most:,} Gaussians, for which {limit} has room; got {num:,}: raise {limit}, "
-                f"or start from some of them, such as start[:{most}]"
-            )
+    _check_given_number(num, stage, system, is_first=index == 0)
     if index == 0 and system.initial_gaussians not in (None, num):
         warnings.warn(
             f"initial_gaussians of {system.initial_gaussians:,} does not apply: training starts from the {num:,} "
@@ -208,6 +195,25 @@ def given_model(start: Model, scene: Scene, system: System, index: int) -> Model
     return dataclasses.replace(
         start, gaussians=gaussians, appearance=start.appearance if keeps_shapes else Appearance()
     )
+
+
+def _check_given_number(num: int, stage: Stage, system: System, *, is_first: bool) -> None:
+    """Raise ValueError, naming the option, unless a stage can start from a number of given Gaussians."""
+    if num < LEAST_LEFT:
+        raise ValueError(f"start must have at least {LEAST_LEFT} Gaussians; got {num}")
+    if not is_first:
+        if system.memory_budget is not None:
+            system.check_given_number(num)
+        return
+    system.check_initial_number(num)
+    for event in stage.events:
+        most = event.most_gaussians
+        if most is not None and num > most:
+            limit = _limit_of(event, system)
+            raise ValueError(
+                f"start must have at most {most:,} Gaussians, for which {limit} has room; got {num:,}: raise {limit}, "
+                f"or start from some of them, such as start[:{most}]"
+            )
 
 
 def left_out(model: Model, degree: int, template: Appearance | None) -> list[str]:
