@@ -21,7 +21,7 @@ def __getattr__(name: str) -> Any:
         return importlib.import_module(f"{__name__}.{name}")
     # Most names start JAX. The command line checks by itself, for commands that do.
     if f"{__name__}.cli" not in sys.modules:
-        importlib.import_module(f"{__name__}.base.machine").check_ulimits()
+        importlib.import_module(f"{__name__}.base.memory").check_ulimits()
     return _import_name(name)
 
 

@@ -18,7 +18,7 @@ from .appearance import (
     project_appearance as project_appearance,
 )
 from .base.checks import check_number as check_number
-from .base.machine import set_num_threads as set_num_threads
+from .base.threads import set_num_threads as set_num_threads
 from .core.bilinear import TextureRegion as TextureRegion
 from .core.cameras import Camera as Camera, back_project as back_project, resize_camera as resize_camera
 from .core.gaussians import Gaussians as Gaussians, init_from_points as init_from_points

@@ -11,13 +11,12 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jax.typing import ArrayLike
 
-from a2tg_jax.appearance import in_words
 from a2tg_jax.base.checks import check_int, check_literal, check_number, check_shape
 from a2tg_jax.base.text import bytes_of
 from a2tg_jax.core.budget import MOST_ROOM, event_budget, within_budget
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree, static
-from a2tg_jax.core.table import Shape, bucket_capacity, resize
+from a2tg_jax.core.table import Layout, Size, resize
 from a2tg_jax.events import Change, Due, GradientStatistics, HostEvent, Statistic, Times, times_at
 from a2tg_jax.model import Model
 from a2tg_jax.texture import BYTES_PER_TEXEL, MAX_SIDE, Textures, check_textures, checked_sizes
@@ -157,7 +156,7 @@ class Upscale(HostEvent):
     def apply(self, due: Due, model: Model, moments: AdamState, state: GradientStatistics) -> Change:
         if model.textures is None:
             raise ValueError(
-                f"{in_words(model.appearance)} cannot grow textures: the stage needs Appearance(texture=Texture())"
+                f"{model.appearance.description} cannot grow textures: the stage needs Appearance(texture=Texture())"
             )
         textures = model.textures
         num = model.num
@@ -196,8 +195,8 @@ class Upscale(HostEvent):
                     grown = larger
         new_sizes[:num] = grown
         kept = None if self.moments == "copied" else (new_sizes == old_sizes).all(axis=1)
-        rebuilt = reallocate(textures, new_sizes, moments, tuple(due.shapes), kept, textures.shape)
-        due.shapes.add(rebuilt.textures.shape)
+        rebuilt = reallocate(textures, new_sizes, moments, tuple(due.layouts), kept, textures.layout)
+        due.layouts.add(rebuilt.textures.layout)
         model = model.with_textures(rebuilt.textures)
         return Change(model, rebuilt.moments, self.init(model), unused=unused)
 
@@ -272,8 +271,8 @@ def next_sizes(
     return np.where(np.isfinite(scales).all(axis=1, keepdims=True), grown, sizes)
 
 
-def most_textures(sizes: np.ndarray, num_bytes: float, cap: int) -> Shape:
-    """Return a shape with room for all textures that `next_sizes` can make of sizes [N, 2] within a number of bytes
+def most_textures(sizes: np.ndarray, num_bytes: float, cap: int) -> Layout:
+    """Return a layout with room for all textures that `next_sizes` can make of sizes [N, 2] within a number of bytes
     (host)."""
     reached = np.unique(sizes, axis=0)
     num_before = 0
@@ -285,14 +284,14 @@ def most_textures(sizes: np.ndarray, num_bytes: float, cap: int) -> Shape:
             for scales in ((1.0, 1.0), (2.0, 1.0), (1.0, 2.0))  # Round; thin along each axis.
         ]
         reached = np.unique(np.concatenate([reached, *larger]), axis=0)
-    counts = {}
+    counts: dict[Size, int] = {}
     for height, width in reached.tolist():
         # Textures of one size alone may take all bytes.
         area = height * width
         count = int(min(len(sizes), num_bytes // (BYTES_PER_TEXEL * area))) if area else len(sizes)
         if count > 0:
-            counts[height, width] = bucket_capacity(count)
-    return Shape(tuple(counts), tuple(counts.values()))
+            counts[height, width] = count
+    return Layout.of(counts)
 
 
 def select(
@@ -361,9 +360,9 @@ def reallocate(
     textures: Textures,
     new_sizes: ArrayLike,
     moments: object = None,
-    known: Sequence[Shape] = (),
+    known: Sequence[Layout] = (),
     kept: ArrayLike | None = None,
-    room: Shape | None = None,
+    room: Layout | None = None,
 ) -> ReallocateResult:
     """Rebuild the buckets at new sizes (host). New texels, and their moments, copy the nearest old one.
 
@@ -375,9 +374,9 @@ def reallocate(
       new_sizes: [N, 2] integers (Tv, Tu), each side 1 to 16, or both 0.
       moments: any pytree, such as the state of Adam: all `Textures` in it are rebuilt, other leaves stay
         unchanged.
-      known: shapes of buckets to prefer, since programs are compiled for them.
+      known: layouts of the buckets to prefer, since programs are compiled for them.
       kept: [N] bool, whose moments are kept, the others' being 0; None: all.
-      room: shape of the buckets, if the textures fit; None: as small as possible, or one of `known`.
+      room: layout of the buckets, if the textures fit; None: as small as possible, or one of `known`.
 
     Returns:
       The named tuple (textures, moments), both at the new sizes.

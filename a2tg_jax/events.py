@@ -27,7 +27,7 @@ from a2tg_jax.core.numerics import safe_divide, safe_norm
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.origin import BLACK, Color
 from a2tg_jax.core.pytree import combine, partition, pytree
-from a2tg_jax.core.table import Shape, map_rows, rows_moved
+from a2tg_jax.core.table import Layout, map_rows, rows_moved
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.pixel import Statistic as Statistic
 from a2tg_jax.rasterize.render_types import RenderSettings
@@ -113,8 +113,8 @@ class Due(NamedFields):
     """Background of the views, RGB in [0, 1]; black where training takes random ones."""
     seed: int = 0
     """Random seed of the system, for draws of the event."""
-    shapes: set[Shape] = dataclasses.field(default_factory=set)
-    """Shapes of textures that steps are compiled for; an event adds the shapes that it makes."""
+    layouts: set[Layout] = dataclasses.field(default_factory=set)
+    """Layouts of textures that steps are compiled for; an event adds the one that it makes."""
     room: TileRoom = dataclasses.field(default_factory=TileRoom)
     """Capacities of tile lists that steps are compiled for."""
 

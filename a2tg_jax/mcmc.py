@@ -18,7 +18,7 @@ from jax import Array
 
 from a2tg_jax.base.checks import check_int, check_number, check_shape
 from a2tg_jax.core.budget import number_to_reach
-from a2tg_jax.core.gaussians import DEAD_OPACITY, MAX_SHARES, Gaussians, check_gaussians, rotation_matrices, share
+from a2tg_jax.core.gaussians import DEAD_OPACITY, MAX_SHARES, Gaussians, check_gaussians, share
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.table import bucket_capacity
@@ -212,7 +212,7 @@ def perturb(
     means = gaussians.means
     dtype = gaussians.means.dtype
     noise = jax.random.normal(key, means.shape, dtype)
-    axes = rotation_matrices(gaussians.quats)[:, :, : scales.shape[1]]
+    axes = gaussians.rotations[:, :, : scales.shape[1]]
     # Sums of products instead of matmuls, which accelerators may round to fewer bits.
     in_plane = jnp.sum(axes * noise[:, :, None], axis=1) * scales**2
     shift = jnp.sum(axes * in_plane[:, None, :], axis=2)

@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from a2tg_jax.appearance import Appearance, count_floats, in_words, template_of
+from a2tg_jax.appearance import Appearance, count_floats
 from a2tg_jax.appearance.base import check_appearance, check_arrays_given, join_rows, num_colors_of, take_rows
 from a2tg_jax.appearance.parts import (
     LEAST_OPACITY,
@@ -274,7 +274,7 @@ class Model(NamedFields):
         facts = [
             ("Gaussians", counted(self.num, "Gaussian")),
             ("view dependence", f"SH degrees {degree} to {MAX_DEGREE}" if has_bands else f"SH degree {degree}"),
-            ("appearance", in_words(self.appearance)),
+            ("appearance", self.appearance.description),
             ("memory", in_bytes(self.num_bytes)),
         ]
         return facts if self.origin is None else [*facts, ("origin", repr(self.origin))]
@@ -335,9 +335,9 @@ def concatenate(models: Sequence[Model]) -> Model:
                 f"models must have textures of one extent; got {options.extent:g} and {others.extent:g}: train them "
                 "with the same lookup.extent, or convert them to plain Gaussians first"
             )
-        if template_of(model.appearance) != template_of(first.appearance):
-            expected = in_words(first.appearance)
-            got = in_words(model.appearance)
+        if model.appearance.template != first.appearance.template:
+            expected = first.appearance.description
+            got = model.appearance.description
             why = f"{expected} and {got}" if got != expected else f"{got} of different options"
             raise ValueError(f"models must have one appearance; got {why}")
         if model.gaussians.means.dtype != first.gaussians.means.dtype:

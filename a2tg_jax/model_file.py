@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax import appearance as built_in
-from a2tg_jax.appearance import Appearance, Bands, Exponents, Texture, TextureOptions, appearance_for
-from a2tg_jax.appearance.base import PARTS, template_of
+from a2tg_jax.appearance import Appearance, Bands, Exponents, Texture, TextureOptions
+from a2tg_jax.appearance.base import PARTS, without_arrays
 from a2tg_jax.appearance.files import arrays_of, with_arrays
 from a2tg_jax.base.archive import arrays_below, read_archive, write_archive
 from a2tg_jax.base.checks import check_shape
@@ -140,7 +140,7 @@ def appearance_to_dict(appearance: Appearance) -> dict[str, Any]:
     except (TypeError, ValueError) as error:
         raise ValueError(f"the options of {kind.__name__} cannot be kept in a file: {error}") from error
     # JSON turns tuples into lists and keys into texts, which not every option survives.
-    if back != template_of(appearance):
+    if back != appearance.template:
         raise ValueError(f"the options of {kind.__name__} do not survive JSON: {described['options']}")
     return described
 
@@ -157,7 +157,7 @@ def appearance_from_dict(data: Mapping[str, Any], appearances: Sequence[type[App
         if name == "Textured":
             return Appearance(texture=config_from_dict(Texture, options, "options of Textured", given={"texels": None}))
         if name == "Plain":
-            return appearance_for(config_from_dict(TextureOptions, options, "options of Plain"), has_textures=False)
+            return Appearance(max_alpha=config_from_dict(TextureOptions, options, "options of Plain").max_alpha)
     # The class was passed, is this package's, or is in a module that is already imported.
     kind: Any = next((each for each in appearances if each.__qualname__ == name), None)
     if kind is None and is_built_in:
@@ -176,7 +176,8 @@ def _options_of(node: Any) -> dict[str, Any]:
     """Return the static fields of an appearance, or of a part."""
     # Static fields are options; the others are arrays, which the archive holds.
     names = [field.name for field in dataclasses.fields(node) if field.metadata.get("static")]
-    return {name: value for name, value in config_to_dict(template_of(node)).items() if name in names}
+    options = config_to_dict(without_arrays(node, lambda path: None))
+    return {name: value for name, value in options.items() if name in names}
 
 
 def _appearance_of(kind: type[Appearance], data: Mapping[str, Any]) -> Appearance:

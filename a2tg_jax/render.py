@@ -18,7 +18,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from a2tg_jax.appearance import Appearance, appearance_for, check_is_appearance
+from a2tg_jax.appearance import Appearance, Texture, check_is_appearance
 from a2tg_jax.appearance.base import num_colors_of
 from a2tg_jax.base.checks import check_floats, check_kind, check_shape, check_unmasked, dtype_of, plain_array
 from a2tg_jax.core.cameras import Camera, check_camera
@@ -216,8 +216,7 @@ def appearance_of(gaussians: Gaussians, textures: Textures | None, settings: Ren
     """Return the appearance of Gaussians and their textures, whose options are `settings.texture`. ValueError: the
     textures do not fit the Gaussians, or there are no settings."""
     check_kind("settings", settings, RenderSettings)
-    appearance = appearance_for(settings.texture, has_textures=textures is not None)
     if textures is None:
-        return appearance
+        return Appearance(max_alpha=settings.texture.max_alpha)
     check_textures(textures, gaussians.num)
-    return appearance.with_textures(textures)
+    return Appearance(texture=Texture(textures, options=settings.texture))

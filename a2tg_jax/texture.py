@@ -32,7 +32,7 @@ class Textures(Table):
       (9, ((1, 1), (4, 2)))
     """
 
-    num_sides: ClassVar[int] = 2
+    num_axes: ClassVar[int] = 2
     padding: ClassVar[tuple[float, ...]] = NEUTRAL_TEXEL
 
     @staticmethod

@@ -29,4 +29,4 @@ if __name__ == "__main__":
     a2tg.configure_cpu()
     name, downscale = sys.argv[1:] or ("", "1")
     scene = a2tg.load_scene(name, downscale=int(downscale)) if name else a2tg.synthetic_scene(width=208, height=156)
-    print(bits_of(a2tg.fit(scene, SYSTEM, progress=False).model))
+    print(bits_of(a2tg.fit(scene, SYSTEM).model))

@@ -20,17 +20,17 @@ def write_runs(folder: Path) -> None:
     from run_folders import create_run
     from small_models import some_model, with_row
 
-    from a2tg_jax import History, save_model
+    from a2tg_jax import History, find_system, save_model
     from a2tg_jax.results.folder import write_json
     from a2tg_jax.results.history import write_history
-    from a2tg_jax.results.record import RunRecord, SceneSource, chosen_system, write_record
+    from a2tg_jax.results.record import RunRecord, SceneSource, write_record
 
     history = History.empty()
     for iteration in range(1, 6):
         history = with_row(history, 1, iteration, 0.5 / iteration, 20.0, 12, 0.1, float(iteration))
     for name in SYSTEMS:
         run = create_run(folder / name)
-        system = chosen_system(name, "smoke")
+        system = type(find_system(name)).preset("smoke")
         record = RunRecord(SceneSource("synthetic"), name, system, ("gaussians-2d-mcmc",), "smoke")
         write_record(run, record)
         for planned in record.plan.stages:

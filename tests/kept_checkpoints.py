@@ -15,4 +15,4 @@ def fit_keeping_checkpoints(scene, system, every: int = 8):
     def keep(checkpoint):
         kept.append(dataclasses.replace(checkpoint, state=jax.tree.map(np.array, checkpoint.state)))
 
-    return fit(scene, system, on_checkpoint=keep, checkpoint_every=every, progress=False), kept
+    return fit(scene, system, on_checkpoint=keep, checkpoint_every=every), kept

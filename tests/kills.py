@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from a2tg_jax.results.folder import RunFolder, iteration_of
+from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.history import read_history
 from a2tg_jax.results.record import read_record
 
@@ -79,7 +79,7 @@ def stage_of(run: RunFolder) -> dict:
     for name in read_record(run).plan.names:
         if not run.model(name).is_file():
             checkpoints = run.checkpoints(name)
-            return {"stage": name, "iteration": iteration_of(checkpoints[-1]) if checkpoints else 0}
+            return {"stage": name, "iteration": int(checkpoints[-1].stem.rpartition("-")[2]) if checkpoints else 0}
     return {"stage": "evaluation", "iteration": 0}
 
 

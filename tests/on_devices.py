@@ -119,7 +119,7 @@ def psnr_of(result):
 
 
 def fit(own, count, **options):
-    return a2tg.fit(scene(), own, progress=False, session=devices(count), **options)
+    return a2tg.fit(scene(), own, session=devices(count), **options)
 
 
 def training(folder):
@@ -152,7 +152,7 @@ def training(folder):
 def textures(folder):
     """Textures grow as on one device; rows that do not divide evenly are filled up."""
     own = system(a2tg.A2tg, densify={"cap": 118}, texture={"at": (0.5,)}, stage2_iterations=8)
-    alone, together = (fit_stage(scene(), own, 1, plain(), progress=False, session=devices(count)) for count in (1, 4))
+    alone, together = (fit_stage(scene(), own, 1, plain(), session=devices(count)) for count in (1, 4))
     assert alone.model.num == together.model.num and alone.model.num_bytes == together.model.num_bytes
     assert together.model.appearance.textures.sizes.max() > 1, "textures have grown"
     assert abs(psnr_of(alone) - psnr_of(together)) < 0.02

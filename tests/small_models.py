@@ -8,7 +8,6 @@ import numpy as np
 
 import a2tg_jax as a2tg
 from a2tg_jax import Bands, Checkpoint, History, Model, Now, Origin, allocate_appearance, init_from_points
-from a2tg_jax.appearance import template_of
 from a2tg_jax.appearance.parts import bands_of_dense
 from a2tg_jax.training.start import initial_state
 
@@ -51,7 +50,7 @@ def billboards(**changes):
 
 def rule_of(appearance):
     """The appearance without its arrays: its class, parts and options."""
-    return template_of(appearance)
+    return appearance.template
 
 
 def assert_same_rule(found, wanted):

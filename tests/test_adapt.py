@@ -33,7 +33,7 @@ from a2tg_jax import (
 )
 from a2tg_jax.adapt import most_textures
 from a2tg_jax.core.budget import event_budget
-from a2tg_jax.core.table import Shape, plan_places
+from a2tg_jax.core.table import Layout, plan_places
 
 ROUND = (0.1, 0.1)
 WIDE = (0.05, 0.009)
@@ -209,16 +209,16 @@ def test_there_is_room_for_all_that_textures_can_become(cap, anisotropic, start)
         resolutions, counts = np.unique(sizes, axis=0, return_counts=True)
         needed = dict(zip(map(tuple, resolutions.tolist()), counts, strict=True))
         assert all(room[size] >= count for size, count in needed.items())
-        places, capacities = plan_places(sizes, room=planned)
-        assert (places.bucket_sizes, capacities) == planned
-        np.testing.assert_array_equal(np.asarray(places.bucket_sizes)[places.bucket], sizes)
+        places = plan_places(sizes, room=planned)
+        assert places.layout == planned
+        np.testing.assert_array_equal(np.asarray(planned.sizes)[places.bucket], sizes)
     assert len(needed) > 3 - 2 * (not anisotropic) and np.prod(sizes, 1).sum() > 0.9 * budget / 16
 
 
 def test_textures_that_outgrow_their_room_get_more():
     sizes = np.array([[1, 1]] * 6 + [[2, 2]] * 3)
-    places, capacities = plan_places(sizes, room=Shape(((1, 1), (2, 2)), (6, 2)))
-    assert places.bucket_sizes == ((1, 1), (2, 2)) and capacities == (6, 3)
+    places = plan_places(sizes, room=Layout(((1, 1), (2, 2)), (6, 2)))
+    assert places.layout == Layout(((1, 1), (2, 2)), (6, 3))
 
 
 def random_textures(seed, num=40, dtype=np.float32):

@@ -38,7 +38,7 @@ def system():
 
 @pytest.fixture(scope="module")
 def model(scene, system):
-    return fit(scene, system, progress=False).model
+    return fit(scene, system).model
 
 
 def moved(view, twist):
@@ -131,7 +131,7 @@ def test_exposures_win_back_what_known_ones_took(scene, system, model):
     known: list[float] = []
     changed = dataclasses.replace(scene, train=tuple(map(disturbed, scene.train)))
     asked = dataclasses.replace(system, exposure=True, corrections=Corrections(affine=Exposure(rate=3e-2)))
-    plain, corrected = (fit(changed, chosen, progress=False).model for chosen in (system, asked))
+    plain, corrected = (fit(changed, chosen).model for chosen in (system, asked))
     learned = corrected.origin.corrections["exposure"][: len(known)]
     assert np.corrcoef(known, np.trace(learned[:, :, :3], axis1=1, axis2=2))[0, 1] > 0.9
     scores = [evaluate(scene.test, found, fit_colors=True).psnr for found in (plain, corrected)]

@@ -28,9 +28,7 @@ from a2tg_jax import (
     render_appearance,
     save_model,
 )
-from a2tg_jax.appearance import appearance_for, in_words
 from a2tg_jax.appearance.base import clear_rows
-from a2tg_jax.appearance.files import arrays_of
 from a2tg_jax.core.gaussians import share
 from a2tg_jax.events import gather_rows
 
@@ -64,10 +62,7 @@ def test_models_are_saved_with_what_they_show(name, tmp_path):
     save_model(tmp_path / "model.npz", model)
     loaded = load_model(tmp_path / "model.npz")
     assert rule_of(loaded.appearance) == APPEARANCES[name] and loaded.num == 30
-    wanted, found = (arrays_of(own.live.appearance, gaussians.sh_degree) for own in (model, loaded))
-    assert wanted.keys() == found.keys()
-    for key in wanted:
-        np.testing.assert_array_equal(wanted[key], found[key])
+    jax.tree.map(np.testing.assert_array_equal, loaded.live.appearance, model.live.appearance)
     if name == "shaped":
         camera = as_camera(draw_scene(2, num=3), "float32")
         expected = model.render(camera).color
@@ -281,10 +276,7 @@ def test_parts_leave_to_an_appearance_what_it_can_do(appearance, wanted):
 
 
 def test_portable_appearances_come_from_their_options_and_have_words():
-    options = TextureOptions.official()
     whole = Appearance(texture=OFFICIAL, exponents=Exponents(), bands=Bands())
-    assert appearance_for(options, has_textures=True, has_degrees=True, has_shapes=True) == whole
-    assert appearance_for(options, has_textures=False) == Appearance(max_alpha=options.max_alpha)
-    assert in_words(whole) == "Gaussians with texture, exponents and bands"
-    assert in_words(Appearance()) == "plain Gaussians" and in_words(movable_kernels()) == "MovableKernels"
-    assert in_words(movable_kernels(exponents=Exponents())) == "MovableKernels with exponents"
+    assert whole.description == "Gaussians with texture, exponents and bands"
+    assert Appearance().description == "plain Gaussians" and movable_kernels().description == "MovableKernels"
+    assert movable_kernels(exponents=Exponents()).description == "MovableKernels with exponents"

@@ -53,7 +53,7 @@ def test_what_is_given_beside_images_is_in_the_views(given):
     assert last.mask.num == 1192 and first.mask is None and second.depth is not None and last.depth is None
     system = a2tg.Gaussians2dMcmc.preset("smoke", stage1_iterations=2, initial_gaussians=None, densify={"cap": 250})
     changed = a2tg.LossConfig(depth_weight=0.1)
-    assert a2tg.fit(scene, dataclasses.replace(system, loss=changed), progress=False).model.num >= 200
+    assert a2tg.fit(scene, dataclasses.replace(system, loss=changed)).model.num >= 200
 
 
 def test_points_may_be_left_out(given):

@@ -14,7 +14,7 @@ def plain_and_textured(sh_degree):
     found = []
     for kind in (a2tg.Gaussians2dMcmc, a2tg.A2tg):
         system = kind.preset("quick", memory_budget=BUDGET, sh_degree=sh_degree, **ITERATIONS)
-        model = a2tg.fit(scene, system, progress=False).model
+        model = a2tg.fit(scene, system).model
         assert 0.99e5 < model.num_bytes <= 1e5
         found.append(a2tg.evaluate(scene.test, model))
     return found

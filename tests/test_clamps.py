@@ -23,9 +23,8 @@ from a2tg_jax import (
     partition,
     project_appearance,
 )
-from a2tg_jax.appearance.parts import LARGEST_LOG_EXPONENT
 from a2tg_jax.core.numerics import at_least, within
-from a2tg_jax.training.start import start_colors
+from a2tg_jax.training.start import initial_model
 
 UNIT = TextureOptions(rgb="unit", alpha="global-maximum")
 CAMERA = a2tg.Camera(jnp.eye(4).at[2, 3].set(2.0), jnp.asarray([[30.0, 0, 8], [0, 30, 8], [0, 0, 1]]), 16, 16)
@@ -86,20 +85,25 @@ def with_colors(colors):
     return dataclasses.replace(SCENE, colors=np.asarray(colors, np.float32))
 
 
+def started(colors):
+    return initial_model(with_colors(colors), a2tg.Gaussians2dMcmc(initial_gaussians=50)).gaussians
+
+
 def test_points_of_one_colour_have_none_and_others_keep_theirs():
     for color in ((0, 0, 0), (1, 1, 1), (0.2, 0, 0)):
         with pytest.warns(UserWarning, match=r"all 50 points of synthetic have one colour \(.*\): taken as points"):
-            np.testing.assert_array_equal(start_colors(with_colors(np.full((50, 3), color))), 0.5)
+            assert not np.asarray(started(np.full((50, 3), color)).sh).any(), "grey"
     nearly_black = np.zeros((50, 3))
     nearly_black[3] = 0.1
     for kept in (np.full((50, 3), 0.502), nearly_black):
-        np.testing.assert_array_equal(start_colors(with_colors(kept)), np.asarray(kept, np.float32))
+        given = a2tg.init_from_points(SCENE.points, with_colors(kept).colors, 50)
+        np.testing.assert_array_equal(started(kept).sh[:, 0], given.sh[:, 0])
 
 
 @pytest.mark.long
 def test_a_channel_that_is_zero_in_all_points_is_learned():
     system = a2tg.Gaussians2dMcmc.preset("smoke", stage1_iterations=600)
-    model = a2tg.fit(with_colors(SCENE.colors * np.asarray([0, 1, 1])), system, progress=False).model
+    model = a2tg.fit(with_colors(SCENE.colors * np.asarray([0, 1, 1])), system).model
     view = SCENE.train[0]
     found, wanted = (np.clip(image[..., 0], 0, 1).mean() for image in (
         model.render(view.camera).color, a2tg.view_image(view)))  # fmt: skip
@@ -157,7 +161,7 @@ def test_alphas_at_their_cap_can_fade():
 def test_exponents_at_their_limit_have_a_gradient():
     gaussians = some_gaussians(5)
     settings = a2tg.RenderSettings(capacity=1024)
-    limit = jnp.full(5, np.arctanh(np.log(0.6) / LARGEST_LOG_EXPONENT), jnp.float32)
+    limit = jnp.full(5, np.arctanh(np.log(0.6)), jnp.float32)
     camera = a2tg.Camera(jnp.eye(4).at[2, 3].set(4.0), CAMERA.K, 16, 16)
 
     def total(shapes):

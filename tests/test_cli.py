@@ -24,16 +24,15 @@ from run_folders import create_run
 from small_files import taken_apart
 from small_models import origin_of
 
-from a2tg_jax import find_system, load_model, load_ply, save_model
+from a2tg_jax import configure_cpu, find_system, load_model, load_ply, save_model
 from a2tg_jax.cli import doctor, main as cli
 from a2tg_jax.cli.arguments import deciding_options
-from a2tg_jax.cli.train import Train, train_defaults
+from a2tg_jax.cli.train import train_defaults
 from a2tg_jax.data.load import SceneSource
 from a2tg_jax.data.synthetic import BUILT_IN
 from a2tg_jax.host import startup
 from a2tg_jax.results import finishing, page_export, run_training, stage_training
 from a2tg_jax.results.folder import RunFolder
-from a2tg_jax.results.frames import LIST
 from a2tg_jax.results.history import read_history
 from a2tg_jax.results.model_source import open_source
 from a2tg_jax.results.record import read_record, write_record
@@ -273,7 +272,7 @@ texture_side = 2
 """
 
 
-def parsed_with_file(folder, text: str, *flags: str) -> Train:
+def parsed_with_file(folder, text: str, *flags: str):
     (folder / "mine.toml").write_text(text)
     return cli.parsed("train", ["--config", str(folder / "mine.toml"), "--out", "run", *flags])
 
@@ -314,16 +313,27 @@ def test_own_systems_are_found_in_the_current_directory(tmp_path, monkeypatch):
 # Settings of JAX
 
 
-def test_flags_of_xla(monkeypatch):
+KEPT_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
+WIDE = "--xla_cpu_prefer_vector_width=512"
+
+
+@pytest.mark.parametrize(
+    ("version", "features", "flags"),
+    [
+        ((0, 12), {"avx512f"}, [KEPT_LOOPS, WIDE]),
+        ((0, 11), set(), [KEPT_LOOPS]),
+        ((0, 10), {"avx512f"}, [KEPT_LOOPS, WIDE, "--xla_cpu_use_fusion_emitters=false"]),
+        ((9, 9), {"avx512f"}, []),
+    ],
+)
+def test_flags_of_xla(monkeypatch, version, features, flags):
     """They fit the processor and the version; the user's own stay."""
-    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_prefer_vector_width=256 --xla_dump_to=x")
-    startup.add_xla_flags(("--xla_cpu_prefer_vector_width=512", "--xla_other=1"))
-    assert os.environ["XLA_FLAGS"] == "--xla_cpu_prefer_vector_width=256 --xla_dump_to=x --xla_other=1"
-    avx512 = frozenset({"avx512f"})
-    assert startup.cpu_flags(avx512, (0, 12)) == (startup.WHOLE_LOOPS_FLAG, startup.WIDE_VECTORS_FLAG)
-    assert startup.cpu_flags(frozenset(), (0, 11)) == (startup.WHOLE_LOOPS_FLAG,)
-    assert startup.cpu_flags(avx512, (0, 10)) == (*startup.cpu_flags(avx512, (0, 12)), startup.OLD_FUSIONS_FLAG)
-    assert startup.cpu_flags(avx512, (9, 9)) == ()
+    monkeypatch.setattr(startup, "processor_features", lambda: frozenset(features))
+    monkeypatch.setattr(jax, "__version_info__", (*version, 0))
+    for given, added in (("--xla_dump_to=x", flags), (f"{WIDE[:-3]}256", [flag for flag in flags if flag != WIDE])):
+        monkeypatch.setenv("XLA_FLAGS", given)
+        configure_cpu(use_cache=False)
+        assert os.environ["XLA_FLAGS"].split() == [given, *added]
 
 
 CACHED = """
@@ -350,15 +360,32 @@ def test_programs_are_kept_and_read_again_in_silence(tmp_path, monkeypatch):
     assert counts[0] == counts[1] > 0
 
 
+@pytest.fixture
+def no_cache():
+    """JAX keeps no programs on disk, whatever commands of this process asked for before."""
+    folder = jax.config.values["jax_compilation_cache_dir"]
+    jax.config.update("jax_compilation_cache_dir", None)
+    yield
+    jax.config.update("jax_compilation_cache_dir", folder)
+
+
+@pytest.mark.usefixtures("no_cache")
 def test_a_user_who_asks_for_the_log_gets_it(monkeypatch):
     asked = []
-    monkeypatch.setattr(jax.config, "update", lambda *given: asked.append(given))
-    monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "0")
-    startup.silence_xla()
-    assert not asked
-    monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "1")
-    startup.silence_xla()
-    assert asked == [("jax_logging_level", "CRITICAL"), ("jax_logging_level", "NOTSET")]
+    monkeypatch.setattr(startup, "processor_features", lambda: frozenset({"avx512f"}))
+    monkeypatch.setattr(jax, "__version_info__", (0, 11, 0))
+    monkeypatch.setenv("XLA_FLAGS", os.environ["XLA_FLAGS"])
+    with monkeypatch.context() as patch:
+        patch.setattr(jax.config, "update", lambda *given: asked.append(given))
+        patch.setenv("TF_CPP_MIN_LOG_LEVEL", "0")
+        configure_cpu()
+        assert [name for name, _ in asked] == [
+            "jax_compilation_cache_dir",
+            "jax_persistent_cache_min_compile_time_secs",
+        ]
+        patch.setenv("TF_CPP_MIN_LOG_LEVEL", "1")
+        configure_cpu()
+        assert asked[4:] == [("jax_logging_level", "CRITICAL"), ("jax_logging_level", "NOTSET")]
 
 
 # A whole run
@@ -639,7 +666,7 @@ def test_flights_without_ffmpeg(run, tmp_path, monkeypatch, capsys):
     command = ["render", str(run.path), "--out", str(tmp_path), "--size", "48x20", "--fps", "8", "--frames"]
     for num, names in ((4, others | {"frame_0002.png", "frame_0003.png"}), (2, others)):
         assert cli.main([*command, str(num)]) == 0
-        made = {"frame_0000.png", "frame_0001.png", "flight.webp", LIST}
+        made = {"frame_0000.png", "frame_0001.png", "flight.webp", ".a2tg-frames"}
         assert {path.name for path in tmp_path.iterdir()} == names | made
     printed = capsys.readouterr().out
     assert (

@@ -32,6 +32,6 @@ def test_a_system_trains(mode, name, cap, iterations):
     changes |= {"densify": {"cap": cap}, "tile_size": 16}
     system = a2tg.find_system(name).preset("paper", **changes)
     with mode():
-        model = a2tg.fit(scene, system, progress=False).model
+        model = a2tg.fit(scene, system).model
     assert model.num != 20
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model.gaussians))

@@ -78,7 +78,7 @@ class WithEvent(Gaussians2dMcmc):
 def test_what_is_not_finite_is_named_and_the_state_before_is_kept(scene, tmp_path):
     system = WithEvent(stage1_iterations=20, **SIZES)
     with pytest.raises(DivergedError) as raised:
-        fit(scene, system, progress=False)
+        fit(scene, system)
     text = str(raised.value)
     assert "not finite at iteration 12 of stage gaussians, view " in text and "\n" not in text
     assert f"after the step, log_scales is not finite in 1 of 60 rows ({BAD_ROW})" in text
@@ -115,7 +115,7 @@ def test_an_explosion_is_seen_in_the_step(scene):
     with pytest.raises(
         DivergedError, match=r"exploded at iteration \d+ of stage .*, view \S+: the loss of \S+ is \d"
     ) as raised:
-        fit(scene, WithEvent(bright=True, stage1_iterations=60, **SIZES), progress=False)
+        fit(scene, WithEvent(bright=True, stage1_iterations=60, **SIZES))
     before = raised.value.checkpoint
     assert 10 < before.iteration < 60 and before.history.loss[-1] < largest_loss(before.history)
 
@@ -139,7 +139,7 @@ def test_ctrl_c_in_the_last_step_interrupts_too(scene):
     with pytest.raises(Interrupted, match="after iteration 10 of stage 1") as stopped, stop_on_signals() as is_stopped:
         fit(scene, system, on_log=press, on_checkpoint=kept.append, is_stopped=is_stopped)
     assert [checkpoint.iteration for checkpoint in kept] == [10]
-    resumed = fit(scene, system, resume=stopped.value.checkpoint, progress=False)
+    resumed = fit(scene, system, resume=stopped.value.checkpoint)
     jax.tree.map(np.testing.assert_array_equal, resumed.model.gaussians, stopped.value.checkpoint.model.gaussians)
 
 
@@ -147,5 +147,5 @@ def test_a_stop_before_the_first_step_is_a_checkpoint(scene):
     system = Gaussians2dMcmc(stage1_iterations=10, **SIZES)
     kept = []
     with pytest.raises(Interrupted, match="after iteration 0 of stage 1"):
-        fit(scene, system, on_checkpoint=kept.append, progress=False, is_stopped=lambda: True)
+        fit(scene, system, on_checkpoint=kept.append, is_stopped=lambda: True)
     assert [checkpoint.iteration for checkpoint in kept] == [0]

@@ -16,7 +16,7 @@ import a2tg_jax as a2tg
 from a2tg_jax import Similarity, turntable
 from a2tg_jax.cli.main import main
 from a2tg_jax.io.columns import decode
-from a2tg_jax.io.edit_file import largest_score, scores_of
+from a2tg_jax.io.edit_file import largest_score
 from a2tg_jax.io.floaters import floater_scores
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.results.editing import edit_of
@@ -96,7 +96,9 @@ def test_the_viewers_file_has_the_same_scores_and_the_vertical():
             count = min(header["chunk"], 300 - sum(map(len, scores)))
             scores.append(decode(coder, body[start : start + length], 1, count)[0])
         start += length
-    np.testing.assert_array_equal(np.sort(np.concatenate(scores)), np.sort(scores_of(model)))
+    numbers = (np.asarray(model.gaussians.means), np.asarray(model.gaussians.log_scales))
+    cameras = (model.origin.viewmats, model.origin.Ks, model.origin.sizes)
+    np.testing.assert_array_equal(np.sort(np.concatenate(scores)), np.sort(floater_scores(*numbers, *cameras)))
     assert header["origin"]["up"] == [0.0, 0.6, 0.8]
     assert model_in(data).origin == model.origin
 

@@ -84,7 +84,7 @@ def test_gradients_agree_with_differences(scene):
 def test_a_short_training_fills_its_budget_and_learns():
     scene = a2tg.synthetic_scene(num_views=4, width=40, height=30, num_points=100)
     smoke = {"stage1_iterations": 200, "stage2_iterations": 20, "initial_opacity": 0.5, "memory_budget": 0.0084}
-    result = a2tg.fit(scene, Gaussians3dMcmc(sh_degree=0, **smoke), progress=False)
+    result = a2tg.fit(scene, Gaussians3dMcmc(sh_degree=0, **smoke))
     assert result.model.num_bytes == result.model.num * 56 == 8400
     assert result.model.appearance.log_thickness.shape == (150,)
     history = result.stages[0].history.psnr

@@ -81,7 +81,7 @@ class Own(a2tg.System):
 
 
 def fitted(scene, *events, **options):
-    return a2tg.fit(scene, Own(events=events, sh_degree=0, **options), progress=False)
+    return a2tg.fit(scene, Own(events=events, sh_degree=0, **options))
 
 
 def test_rows_that_stay_come_first_at_the_same_shapes():
@@ -215,7 +215,7 @@ def test_choices_about_anisotropy_that_make_no_difference_are_warned_of(scene, g
     start = a2tg.Model(a2tg.init_from_points(scene.points, scene.colors))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        a2tg.training.fit_stage(scene, system, 1, start, progress=False)
+        a2tg.training.fit_stage(scene, system, 1, start)
     wanted = [f"stage 'textures': texture.{name} made no difference: no Gaussian whose" for name in given]
     assert [str(one.message)[: len(wanted[0])] for one in caught] == wanted
 

@@ -95,7 +95,7 @@ def test_anisotropy_acts_at_the_smoke_scale():
     """Only a Gaussian that is elongated and thin gets a texture that is not square."""
     grid = read_grid("ablation", "smoke")
     scene = a2tg.synthetic_scene(num_views=4, width=104, height=78, num_points=500)
-    sizes = a2tg.fit(scene, grid.reference_job(grid.cells[0]).system, progress=False).model.textures.sizes
+    sizes = a2tg.fit(scene, grid.reference_job(grid.cells[0]).system).model.textures.sizes
     assert (sizes[:, 0] != sizes[:, 1]).sum() > 10
 
 

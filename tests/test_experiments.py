@@ -36,13 +36,13 @@ def test_a_stage_stopped_under_one_system_continues_under_another(tmp_path, monk
     folders = Folders(tmp_path, tmp_path)
     former = tmp_path / "checkpoints" / f"{job.key}.npz"
     stopped = lambda checkpoint: checkpoint.iteration == 2 and a2tg.save_checkpoint(former, checkpoint)  # noqa: E731
-    whole = fit_stage(scene, plain, 0, on_checkpoint=stopped, checkpoint_every=2, progress=False).model
+    whole = fit_stage(scene, plain, 0, on_checkpoint=stopped, checkpoint_every=2).model
     record = run_job(job, folders)
     assert record["training_seconds"] is None, "the time up to the checkpoint is not known"
     np.testing.assert_array_equal(a2tg.load_model(folders.model(job)).gaussians.means, whole.gaussians.means)
     assert not [*former.parent.iterdir()]
     other = Job("synthetic", 1, dataclasses.replace(textured, seed=5), 0)
-    fit_stage(scene, plain, 0, on_checkpoint=stopped, checkpoint_every=2, progress=False)
+    fit_stage(scene, plain, 0, on_checkpoint=stopped, checkpoint_every=2)
     former.replace(former.with_name(f"{other.key}.npz"))
     with pytest.raises(ValueError, match="made with another seed"):
         run_job(other, folders)
@@ -55,7 +55,7 @@ def test_the_checkpoint_before_a_damaged_one_continues_a_stage(tmp_path, monkeyp
     folders = Folders(tmp_path, tmp_path)
     files = folders.files
     keep = lambda checkpoint: a2tg.save_checkpoint(files.checkpoint(job.key, checkpoint.iteration), checkpoint)  # noqa: E731
-    whole = fit_stage(scene, job.system, 0, on_checkpoint=keep, checkpoint_every=2, progress=False).model
+    whole = fit_stage(scene, job.system, 0, on_checkpoint=keep, checkpoint_every=2).model
     newest = files.checkpoints(job.key)[-1]
     newest.write_bytes(newest.read_bytes()[:1000])
     with pytest.warns(UserWarning, match="training continues from .*-0000000002.npz"):

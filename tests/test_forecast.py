@@ -15,13 +15,12 @@ from toy_system import Toy
 
 import a2tg_jax as a2tg
 from a2tg_jax import Mcmc, Picture, Prune, resize_camera
-from a2tg_jax.base import machine
-from a2tg_jax.base.machine import allowed_memory
+from a2tg_jax.base import machine, memory
+from a2tg_jax.base.memory import allowed_memory
 from a2tg_jax.cli import main as cli
 from a2tg_jax.cli.training import ask
 from a2tg_jax.host import progress_bars
 from a2tg_jax.results import forecast
-from a2tg_jax.results.commands import quick_flags
 from a2tg_jax.results.forecast import (
     Bytes,
     RunForecast,
@@ -209,25 +208,24 @@ def test_a_system_names_its_own_limit(system, option):
 
 
 @pytest.mark.parametrize(
-    ("preset", "size", "flags"),
+    ("preset", "downscale", "size", "flags"),
     [
-        ("paper", (1600, 1067), "--preset quick --downscale 6"),
-        ("paper", (320, 213), "--preset quick --downscale 2"),
-        ("quick", (3200, 2133), "--preset quick --downscale 10"),
-        ("quick", (320, 213), None),
+        ("paper", 2, (1600, 1067), "--preset quick --downscale 6"),
+        ("paper", 2, (320, 213), "--preset quick --downscale 2"),
+        ("paper", 1, (100, 67), "--preset quick"),
+        ("paper", 1, (640, 427), "--preset quick"),
+        ("paper", 1, (641, 427), "--preset quick --downscale 2"),
+        ("paper", 1, (4000, 2667), "--preset quick --downscale 7"),
+        ("quick", 2, (3200, 2133), "--preset quick --downscale 10"),
+        ("quick", 2, (320, 213), None),
     ],
 )
-def test_the_forecast_of_a_long_run_has_quicker_flags(monkeypatch, tmp_path, preset, size, flags):
-    monkeypatch.setattr(machine, "memory_limit", lambda: 10**12)
-    record = RunRecord(SceneSource("fox", downscale=2), "a2tg", a2tg.A2tg.preset(preset), preset=preset)
+def test_the_forecast_of_a_long_run_has_quicker_flags(monkeypatch, tmp_path, preset, downscale, size, flags):
+    monkeypatch.setattr(memory, "memory_limit", lambda: 10**12)
+    record = RunRecord(SceneSource("fox", downscale=downscale), "a2tg", a2tg.A2tg.preset(preset), preset=preset)
     text = checked_forecast(scene_of(*size), record, None, out=tmp_path)
     assert text.endswith(f"\nquicker on CPUs: {flags} takes minutes") == (flags is not None)
     assert "quicker" not in checked_forecast(scene_of(*size), record, None), "a resumed run keeps its options"
-
-
-def test_the_downscale_of_quick_runs():
-    downscales = {100: "", 640: "", 641: " --downscale 2", 4000: " --downscale 7"}
-    assert {side: quick_flags(side).removeprefix("--preset quick") for side in downscales} == downscales
 
 
 def test_a_forecast_is_two_lines_of_text(monkeypatch):
@@ -237,7 +235,7 @@ def test_a_forecast_is_two_lines_of_text(monkeypatch):
         f"memory: at least 1.50 GB ({parts}); 8.00 GB may be used",
         "disk: about 3.00 MB in the run folder",
     ]
-    monkeypatch.setattr(machine, "memory_limit", lambda: 64 * 10**9)
+    monkeypatch.setattr(memory, "memory_limit", lambda: 64 * 10**9)
     text = checked_forecast(SMALL, RunRecord(SceneSource("synthetic"), "a2tg", a2tg.A2tg.preset("smoke")), None)
     assert "64.0 GB may be used\ndisk: about " in text
 
@@ -250,14 +248,14 @@ def test_on_an_accelerator_its_own_memory_counts(monkeypatch):
             return {"bytes_limit": 6 * 10**9}
 
     scene, system = scene_of(600, 400), a2tg.Gaussians2dMcmc()
-    monkeypatch.setattr(machine, "default_device", Device)
+    monkeypatch.setattr(memory, "default_device", Device)
     found = run_of(scene, system)
     assert allowed_memory(None) == 6e9 and allowed_memory(5e9) == 5e9
     assert found.peak[1].program == 0
 
 
 def test_the_state_must_fit_on_one_of_several_devices(monkeypatch):
-    monkeypatch.setattr(machine, "memory_limit", lambda: 10**12)
+    monkeypatch.setattr(memory, "memory_limit", lambda: 10**12)
     scene, capped = SMALL, a2tg.Mcmc(cap=10**6)
     pruned = a2tg.Gaussians2dMcmc(densify=capped, prune=Prune(share=0.1, at=(0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)))
     record, found = RunRecord(SceneSource("synthetic"), "gaussians-2d-mcmc", pruned), run_of(scene, pruned)
@@ -288,9 +286,9 @@ def test_rows_beyond_the_machine_are_refused_before_they_are_allocated(monkeypat
         wanted = "densify.cap is too large for this machine "
     start = initial_model(scene, kind.preset("smoke"))
     for train in (
-        lambda: a2tg.fit(scene, system, progress=False),
-        lambda: a2tg.fit(scene, system, start=start, progress=False),
-        lambda: a2tg.fit_stage(scene, system, 0, progress=False),
+        lambda: a2tg.fit(scene, system),
+        lambda: a2tg.fit(scene, system, start=start),
+        lambda: a2tg.fit_stage(scene, system, 0),
     ):
         with pytest.raises(ValueError, match=f"^{wanted}.*Gaussians of 232 bytes, and 4 copies .* may be used: lower"):
             train()
@@ -301,29 +299,29 @@ def test_a_later_stage_beyond_the_machine_is_refused_before_the_first(monkeypatc
     scene, system = a2tg.synthetic_scene(), a2tg.A2tg.preset("smoke", memory_budget=1)
     limits = {first: 4 * forecast.model_bytes for first, forecast in enumerate(forecast_stages(scene, system))}
     assert limits[0] < limits[1] == 4 * MB
-    monkeypatch.setattr(machine, "memory_limit", lambda: limits[1])
-    check_rows_fit(scene, system, 0, None, machine.ALONE)
-    monkeypatch.setattr(machine, "memory_limit", lambda: limits[1] - 1)
+    monkeypatch.setattr(memory, "memory_limit", lambda: limits[1])
+    check_rows_fit(scene, system, 0, None, machine.Devices())
+    monkeypatch.setattr(memory, "memory_limit", lambda: limits[1] - 1)
     for first, num_start in ((0, None), (1, 3205)):
         with pytest.raises(ValueError, match=r"stage 'textures' trains up to 3,205 .* at least 4.00 MB"):
-            check_rows_fit(scene, system, first, num_start, machine.ALONE)
-    check_rows_fit(scene, system, 0, None, machine.ALONE, max_memory=limits[1])
+            check_rows_fit(scene, system, first, num_start, machine.Devices())
+    check_rows_fit(scene, system, 0, None, machine.Devices(), max_memory=limits[1])
     check_rows_fit(scene, system, 0, None, machine.Devices(1, 2))  # Other machines' memory is not known.
 
 
 def test_the_start_is_named_if_it_is_too_large(monkeypatch):
-    monkeypatch.setattr(machine, "memory_limit", lambda: 10**6)
+    monkeypatch.setattr(memory, "memory_limit", lambda: 10**6)
     system = a2tg.Gaussians2dMcmc.preset("smoke", densify=a2tg.Mcmc(cap=0))
     with pytest.raises(ValueError, match=r"^start is too large .* up to 2,000 Gaussians"):
-        check_rows_fit(SMALL, system, 0, 2000, machine.ALONE)
+        check_rows_fit(SMALL, system, 0, 2000, machine.Devices())
 
 
 def test_max_memory_allows_what_a_machine_does_not_report(monkeypatch):
-    monkeypatch.setattr(machine, "memory_limit", lambda: 10**5)
+    monkeypatch.setattr(memory, "memory_limit", lambda: 10**5)
     scene, system = a2tg.synthetic_scene(num_views=4), a2tg.Gaussians2dMcmc.preset("smoke", stage1_iterations=2)
     with pytest.raises(ValueError, match=r"densify\.cap is too large .* allow more with max_memory"):
-        a2tg.fit_stage(scene, system, 0, progress=False)
-    assert a2tg.fit_stage(scene, system, 0, progress=False, max_memory=10**12).model.num > 1
+        a2tg.fit_stage(scene, system, 0)
+    assert a2tg.fit_stage(scene, system, 0, max_memory=10**12).model.num > 1
 
 
 @pytest.mark.parametrize("group", ["texture", "view_dependence"])
@@ -351,9 +349,9 @@ def test_each_of_several_devices_has_a_copy_of_the_model_and_its_gradients():
 
 
 def test_on_a_cpu_the_memory_that_is_free_counts(monkeypatch):
-    monkeypatch.setattr(machine, "memory_limit", lambda: 123 * MB)
+    monkeypatch.setattr(memory, "memory_limit", lambda: 123 * MB)
     assert allowed_memory(None) == 123 * MB and allowed_memory(1.0) == 1
-    assert machine.memory_limit() > MB
+    assert memory.memory_limit() > MB
     assert room_for_photographs(8 * 10**9) == 2 * 10**9  # A quarter of what is allowed.
     assert room_for_photographs(None) is None
 

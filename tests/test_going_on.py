@@ -22,7 +22,7 @@ SESSION = Session()
 
 
 def fitted(system, **options):
-    return a2tg.fit(SCENE, system, progress=False, session=SESSION, **options)
+    return a2tg.fit(SCENE, system, session=SESSION, **options)
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def test_pictures_are_never_worse_than_before(result):
     jitted_step().clear_cache()
     with compiled_programs("train_step") as programs:
         for _ in range(3):
-            result = result.more(SCENE, 20, progress=False, session=SESSION)
+            result = result.more(SCENE, 20, session=SESSION)
             psnr.append(a2tg.evaluate(SCENE.train, result.model).psnr)
     assert len(programs) == 1
     assert [stage.name for stage in result.stages] == ["gaussians", "continued", "more", "more-2", "more-3"]
@@ -72,7 +72,7 @@ def test_every_way_to_go_on_gives_the_same_bits(result, tmp_path):
     system = dataclasses.replace(SYSTEM, more=(24,))
     at_once = fitted(system)
     wanted = bits_of(at_once.model)
-    assert bits_of(result.more(SCENE, 24, progress=False, session=SESSION).model) == wanted
+    assert bits_of(result.more(SCENE, 24, session=SESSION).model) == wanted
     a2tg.save_checkpoint(tmp_path / "end.npz", result.checkpoint)
     end = a2tg.load_checkpoint(tmp_path / "end.npz")
     assert bits_of(fitted(system, resume=end).model) == wanted
@@ -94,7 +94,7 @@ def test_textures_corrections_and_budgets_go_on(name):
     own = {"memory_budget": "20kB", "exposure": True, "refine_poses": True, **lengths}
     system = a2tg.find_system(name).preset("smoke", initial_gaussians=60, **own)
     first = fitted(system)
-    further = first.more(SCENE, 30, progress=False, session=SESSION)
+    further = first.more(SCENE, 30, session=SESSION)
     before, after = first.model, further.model
     assert after.num == before.num and after.num_bytes == before.num_bytes <= 20_000
     if before.textures is not None:
@@ -132,7 +132,7 @@ class Watched(a2tg.Gaussians2dMcmc):
 
 def test_schedules_and_events_of_every_iteration_stay_at_their_end():
     first = fitted(Watched.preset("smoke", stage1_iterations=20, **SMALL))
-    further = first.more(SCENE, 7, progress=False, session=SESSION)
+    further = first.more(SCENE, 7, session=SESSION)
     (calls, iteration, length, rate), (all_calls, *then) = (
         np.asarray(fit.checkpoint.state.events[0]) for fit in (first, further)
     )
@@ -174,7 +174,7 @@ START = dataclasses.replace(SYSTEM, stage1_iterations=10, stage2_iterations=0, i
 
 def test_a_system_is_trained_from_a_model_as_its_first_stage(result):
     whole = fitted(START, start=result.model).model
-    assert bits_of(whole) == bits_of(fit_stage(SCENE, START, 0, result.model, progress=False).model)
+    assert bits_of(whole) == bits_of(fit_stage(SCENE, START, 0, result.model).model)
     assert whole.num == 110
 
 
@@ -197,7 +197,7 @@ def test_options_that_contradict_the_given_model_are_named(result):
     with pytest.warns(UserWarning, match="made in another world than the scene's"):
         fitted(START, start=moved)
     textured = a2tg.A2tg(stage1_iterations=10, stage2_iterations=10, sh_degree=1, densify=START.densify)
-    shown = fit_stage(SCENE, textured, 1, model, progress=False).model
+    shown = fit_stage(SCENE, textured, 1, model).model
     with pytest.warns(UserWarning, match="start: stage 'gaussians' leaves out what its splats show besides Gaussians"):
         fitted(START, start=shown)
     with pytest.raises(ValueError, match=r"memory_budget of 0.008 MB has room for"):
@@ -277,7 +277,7 @@ def test_an_event_with_a_cap_caps_the_start():
         fitted(smaller, start=fitted(system).model)
     two = dataclasses.replace(smaller, stage2_iterations=5)
     with pytest.warns(UserWarning, match=r"begins with 40 Gaussians, more than the growing\.cap of 30: none is added"):
-        fit_stage(SCENE, two, 1, fitted(system).model, progress=False)
+        fit_stage(SCENE, two, 1, fitted(system).model)
 
 
 # Resuming with another scene
@@ -302,7 +302,7 @@ def with_first_view(**changes):
 
 
 def resumed(scene, path):
-    return a2tg.fit(scene, START, resume=a2tg.load_checkpoint(path), progress=False, session=SESSION).model
+    return a2tg.fit(scene, START, resume=a2tg.load_checkpoint(path), session=SESSION).model
 
 
 def test_other_views_are_named(middle):

@@ -18,7 +18,7 @@ def test_a_run_of_version_0_1_0_is_repeated():
         stage1_iterations=120, stage2_iterations=80, initial_gaussians=200, seed=3, densify=a2tg.Mcmc(cap=260),
         texture=a2tg.Upscale(at=(0.3, 0.6), moments="copied"),
     )  # fmt: skip
-    history = a2tg.fit(scene, system, progress=False).history
+    history = a2tg.fit(scene, system).history
     np.testing.assert_array_equal(history.num_gaussians, recorded["num_gaussians"])
     np.testing.assert_allclose(history.loss[:2], recorded["loss"][:2], rtol=1e-5)
     np.testing.assert_allclose(history.loss, recorded["loss"], rtol=1e-2)

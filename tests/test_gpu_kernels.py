@@ -22,7 +22,7 @@ from scenes_random import (
 
 from a2tg_jax import Appearance, RenderSettings, Texture, TextureOptions, combine, partition, render_image
 from a2tg_jax.appearance import StaticShading
-from a2tg_jax.rasterize.kernels.cuda import composite, nvrtc
+from a2tg_jax.rasterize.kernels.cuda import nvrtc
 from a2tg_jax.rasterize.kernels.cuda.source import PRIMITIVES, Argument, c_function, source
 from a2tg_jax.rasterize.kernels.jaxprs import Untranslatable, example, trace
 from a2tg_jax.rasterize.kernels.native import lanes as of_native
@@ -97,7 +97,7 @@ def test_xla_takes_them():
         return jnp.sum(render_image(gaussians, camera, settings=settings).color)
 
     lowered = jax.jit(jax.grad(loss)).trace(gaussians).lower(lowering_platforms=("cuda",)).as_text()
-    calls = re.findall(rf"custom_call @{re.escape(composite.TARGET)}.*", lowered.replace('"', ""))
+    calls = re.findall(rf"custom_call @{re.escape('__gpu$xla.gpu.ptx')}.*", lowered.replace('"', ""))
     assert len(calls) == 2
     for name, call in zip(("forward", "backward"), calls, strict=True):
         assert f"name = {name}" in call and "block_x = 256" in call and "grid_x = 6 " in call

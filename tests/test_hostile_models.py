@@ -34,11 +34,9 @@ from a2tg_jax import (
 )
 from a2tg_jax.base.json_text import parse_json
 from a2tg_jax.base.npz import read_npz
-from a2tg_jax.core.table import check_places
 from a2tg_jax.io import ply
 from a2tg_jax.model import check_model
 from a2tg_jax.rasterize.views import render_traced
-from a2tg_jax.texture import check_textures
 from a2tg_jax.training.registry import system_from_dict
 
 
@@ -161,7 +159,10 @@ def test_textures_lie_within_their_buckets_and_apart():
         buckets = jnp.zeros((4, 1, 1, 4)), jnp.zeros((2, 2, 1, 4))
         return Textures(buckets, jnp.asarray(bucket, jnp.int32), jnp.asarray(row, jnp.int32), ((1, 1), (2, 1)))
 
-    check_places(placed([0, 0, 1], [0, 3, 1]))
+    def checked(textures):
+        check_model(Model(some_gaussians()[:3], a2tg.Appearance(texture=a2tg.Texture(textures))))
+
+    checked(placed([0, 0, 1], [0, 3, 1]))
     for bucket, row, message in [
         ([0, 0, 1], [0, 4, 1], "textures.row must be below the number"),
         ([0, 0, 1], [0, -1, 1], "textures.row must be below the number"),
@@ -170,10 +171,7 @@ def test_textures_lie_within_their_buckets_and_apart():
         ([0, 0, 1], [2, 2, 0], "some share one"),
     ]:
         with pytest.raises(ValueError, match=message):
-            check_textures(placed(bucket, row))
-            check_places(placed(bucket, row))
-        with pytest.raises(ValueError, match=message):
-            check_model(Model(some_gaussians()[:3], a2tg.Appearance(texture=a2tg.Texture(placed(bucket, row)))))
+            checked(placed(bucket, row))
 
 
 # Numbers at the limit, and files that are none

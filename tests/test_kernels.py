@@ -25,9 +25,9 @@ from a2tg_jax import (
     static,
     textures_from_arrays,
 )
-from a2tg_jax.appearance import StaticShading, gaussian_cutoff
-from a2tg_jax.core.geometry import homographies
+from a2tg_jax.appearance import StaticShading
 from a2tg_jax.rasterize.kernels.native import composite as native, ffi
+from a2tg_jax.rasterize.splats import project_gaussians
 from a2tg_jax.rasterize.tiles import TileGrid, tile_lists, total_pairs
 from a2tg_jax.rasterize.views import render_traced
 
@@ -43,9 +43,9 @@ def test_lists_are_those_of_xla(monkeypatch, dtype):
     scene = draw_scene(4, num=300)
     gaussians = as_gaussians(scene, dtype)
     camera = as_camera(scene, dtype)
-    M, _ = homographies(gaussians, camera)
+    drawn, cutoff = project_gaussians(gaussians, camera, Appearance(), 0.2, 3)
     # Equal depths, to see ties in order of the index.
-    splats = M.at[:, 2, 2].set(jnp.round(M[:, 2, 2], 1)), gaussian_cutoff(gaussians.opacities), 0.2
+    splats = drawn.M.at[:, 2, 2].set(jnp.round(drawn.M[:, 2, 2], 1)), cutoff, 0.2
     for tile_size in (8, 16):
         grid = TileGrid(scene.width, scene.height, tile_size)
         ours = jax.jit(lambda grid=grid: native.tile_lists(*splats, grid, 20_000))()

@@ -21,7 +21,7 @@ from a2tg_jax import (
 from a2tg_jax.rasterize.kernels import platforms, window_scores
 from a2tg_jax.rasterize.kernels.native import ffi, ssim as kernel
 from a2tg_jax.rasterize.kernels.score import Score
-from a2tg_jax.training.losses import depth_normals, mean_ssim
+from a2tg_jax.training.losses import mean_ssim
 
 
 def random_pair(height, width, noise, dtype=np.float64, seed=0):
@@ -123,13 +123,6 @@ def plane_view(width=17, height=13):
     depth = normal[2] * 4 / (rays @ normal)
     camera = Camera(jnp.asarray(viewmat), jnp.asarray(K), width, height)
     return camera, jnp.asarray(depth), jnp.asarray(rotation.T @ normal)
-
-
-def test_depth_normals_of_a_plane_are_its_normal(x64):
-    camera, depth, normal = plane_view()
-    normals, is_defined = depth_normals(depth, depth > 0, camera)
-    assert is_defined.all()
-    np.testing.assert_allclose(normals, jnp.broadcast_to(normal, normals.shape), atol=1e-12)
 
 
 def test_normal_consistency_is_zero_on_its_own_plane_at_any_alpha(x64):

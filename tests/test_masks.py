@@ -289,7 +289,7 @@ def masked():
 @pytest.mark.long
 def test_masked_pixels_do_not_reach_training(masked):
     system = Gaussians2dMcmc(stage1_iterations=24, initial_gaussians=60, batch_size=2)
-    clean, noisy = (fit(scene, system, progress=False) for scene in masked)
+    clean, noisy = (fit(scene, system) for scene in masked)
     jax.tree.map(np.testing.assert_array_equal, clean.model.gaussians, noisy.model.gaussians)
     np.testing.assert_array_equal(clean.history.psnr, noisy.history.psnr)
     polished = [polish(clean.model, scene.train, num_steps=2).gaussians.sh for scene in masked]
@@ -304,7 +304,7 @@ def test_a_view_counts_by_its_pixels(masked):
     scene = dataclasses.replace(masked[0], train=masked[0].train[:1])
     system = Gaussians2dMcmc(stage1_iterations=1, initial_gaussians=60)
     start = initial_model(scene, system)
-    logged = fit(scene, system, progress=False).history.psnr[0]
+    logged = fit(scene, system).history.psnr[0]
     image = np.asarray(start.render(scene.train[0].camera).color)
     view = scene.train[0]
     error = (np.clip(image, 0, 1) - view.image / 255.0)[view.mask.read()]

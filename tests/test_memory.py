@@ -11,8 +11,8 @@ import psutil
 import pytest
 
 from a2tg_jax import Gaussians2dMcmc, Session, fit, synthetic_scene
-from a2tg_jax.base import machine, operating_system
-from a2tg_jax.base.machine import keep_room_for_programs, memory_limit, tidy_memory
+from a2tg_jax.base import memory, operating_system
+from a2tg_jax.base.memory import keep_room_for_programs, memory_limit, tidy_memory
 from a2tg_jax.base.operating_system import trim_heap
 from a2tg_jax.host.errors import error_text
 from a2tg_jax.training.step import jitted_step
@@ -44,7 +44,7 @@ def test_without_proc_nothing_happens(tmp_path):
 @pytest.mark.long
 def test_training_calls_its_session_after_compiling(monkeypatch):
     """A limit of 0 memory mappings makes every compilation exceed it."""
-    monkeypatch.setattr(machine, "LARGEST_SHARE", 0)
+    monkeypatch.setattr(memory, "LARGEST_SHARE", 0)
     scene = synthetic_scene(num_views=3, width=24, height=16, num_points=40)
     dropped = []
     double = jax.jit(lambda x: 2 * x)
@@ -56,7 +56,7 @@ def test_training_calls_its_session_after_compiling(monkeypatch):
         dropped.append(double._cache_size())
 
     jitted_step().clear_cache()
-    fit(scene, Gaussians2dMcmc(stage1_iterations=2), progress=False, session=Session(tidy))
+    fit(scene, Gaussians2dMcmc(stage1_iterations=2), session=Session(tidy))
     assert dropped[:2] == [1, 0]
 
 
@@ -107,17 +107,17 @@ def test_the_memory_of_this_process():
 
 @pytest.mark.parametrize("letter, used", [("v", 300 * 1024), ("d", 200 * 1024)])
 def test_a_ulimit_counts_what_is_reserved(tmp_path, monkeypatch, letter, used):
-    monkeypatch.setattr(machine, "ulimits", lambda: {letter: used + 50 * 1024})
+    monkeypatch.setattr(memory, "ulimits", lambda: {letter: used + 50 * 1024})
     monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=900 * 1024))
-    memory = SimpleNamespace(rss=100 * 1024, vms=300 * 1024, data=200 * 1024)
-    monkeypatch.setattr(psutil, "Process", lambda: SimpleNamespace(memory_info=lambda: memory))
+    used_now = SimpleNamespace(rss=100 * 1024, vms=300 * 1024, data=200 * 1024)
+    monkeypatch.setattr(psutil, "Process", lambda: SimpleNamespace(memory_info=lambda: used_now))
     assert memory_limit(tmp_path) == 150 * 1024
 
 
 SMALL_FIT = """
 import a2tg_jax as a2tg
 scene = a2tg.synthetic_scene(num_views=3, width=24, height=16, num_points=40)
-print(a2tg.fit(scene, a2tg.Gaussians2dMcmc(stage1_iterations=2), progress=False))
+print(a2tg.fit(scene, a2tg.Gaussians2dMcmc(stage1_iterations=2)))
 """
 
 
@@ -152,8 +152,8 @@ def test_what_needs_no_jax_runs_within_a_small_ulimit():
 @pytest.mark.long
 @pytest.mark.parametrize("option, letter", [("as", "v"), ("data", "d")])
 def test_the_least_ulimit_is_enough(option, letter):
-    stacks = machine.STACKS_PER_CORE * operating_system.num_cores() * operating_system.stack_bytes()
-    done = limited(option, machine.LEAST_ULIMITS[letter] + stacks, "-c", SMALL_FIT)
+    stacks = memory.STACKS_PER_CORE * operating_system.num_cores() * operating_system.stack_bytes()
+    done = limited(option, memory.LEAST_ULIMITS[letter] + stacks, "-c", SMALL_FIT)
     assert done.returncode == 0 and "FitResult(" in done.stdout, done.stderr
 
 

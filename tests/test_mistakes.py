@@ -33,7 +33,6 @@ from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.results import run_training
 from a2tg_jax.results.record import RunRecord, write_record
 from a2tg_jax.training import corrections, losses, options
-from a2tg_jax.training.checkpoint import check_resume
 from a2tg_jax.training.start import initial_model
 
 
@@ -312,7 +311,7 @@ def tiny(side=16) -> a2tg.Scene:
 
 
 def trained(scene=None, **given):
-    return a2tg.fit(scene or tiny(), Own(given=given, loss=a2tg.LossConfig(ssim_weight=0)), progress=False)
+    return a2tg.fit(scene or tiny(), Own(given=given, loss=a2tg.LossConfig(ssim_weight=0)))
 
 
 def staged(**given):
@@ -679,7 +678,11 @@ def test_a_redefined_class_is_another_one():
         return Redefined
 
     with pytest.raises(ValueError, match=r"before it was defined again\): resume with checkpoint.system, or"):
-        check_resume(Checkpoint(defined()(), 0, None, History.empty()), defined()())
+        a2tg.fit(
+            dataclasses.replace(SCENE, train=(VIEW,)),
+            defined()(),
+            resume=Checkpoint(defined()(), 0, None, History.empty()),
+        )
 
 
 def test_a_capacity_that_is_too_small_warns_eagerly():
@@ -784,7 +787,7 @@ def test_a_matrix_product_in_shade_is_composited_by_xla(monkeypatch):
         found = drawn(MIXED, "auto")
     np.testing.assert_allclose(found, drawn(MIXED_BY_HAND, "auto"), atol=1e-5)
     monkeypatch.setitem(platforms.PLATFORMS, "cuda", "cpu")
-    monkeypatch.setattr(platforms.nvrtc, "find", lambda: True)
+    monkeypatch.setattr("a2tg_jax.rasterize.kernels.cuda.nvrtc.find", lambda: True)
     for name in ("native", "cuda"):
         with pytest.raises(
             ValueError, match=rf"compositor='{name}' cannot run Mixed: .*{printed_text}\. Say 'xla', or 'auto'"

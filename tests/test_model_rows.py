@@ -24,9 +24,9 @@ from a2tg_jax import (
     textures_from_arrays,
     value_and_grad,
 )
-from a2tg_jax.appearance.base import check_appearance
 from a2tg_jax.core.table import Table
 from a2tg_jax.events import gather_moments, gather_rows
+from a2tg_jax.model import check_model
 
 NUM = 12
 SIZES = [(1, 1), (4, 2), (2, 2)]
@@ -79,7 +79,7 @@ def rows_of(model: Model) -> list[np.ndarray]:
 
 def assert_rows(found: Model, wanted: list[np.ndarray]) -> None:
     assert found.num_live is None and found.num == len(wanted)
-    check_appearance(found.appearance, found.gaussians)
+    check_model(found)
     for a, b in zip(rows_of(found), wanted, strict=True):
         np.testing.assert_array_equal(a, b)
 

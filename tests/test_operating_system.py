@@ -17,7 +17,7 @@ from scenes_random import as_camera, as_gaussians, draw_scene
 
 import a2tg_jax
 from a2tg_jax import render_image
-from a2tg_jax.base import machine, operating_system
+from a2tg_jax.base import control_groups, machine, operating_system, threads as threads_module
 from a2tg_jax.host import signals
 from a2tg_jax.rasterize.kernels.native import composite as native, ffi
 
@@ -163,7 +163,8 @@ def without_encoding(path):
 
 def test_text_is_utf8_on_every_system():
     """Except what Linux, and what the package's metadata, say of themselves."""
-    modules = [path for path in (ROOT / "a2tg_jax").rglob("*.py") if path.stem not in ("machine", "source_commit")]
+    of_system = {"control_groups", "machine", "memory", "source_commit"}
+    modules = [path for path in (ROOT / "a2tg_jax").rglob("*.py") if path.stem not in of_system]
     assert len(modules) > 100 and not [line for path in modules for line in without_encoding(path)]
     assert list(without_encoding(ROOT / "a2tg_jax" / "base" / "machine.py"))
 
@@ -179,7 +180,7 @@ def test_files_of_the_project_can_lie_on_every_system():
 
 @pytest.mark.parametrize("num", [1, 2])
 def test_a_noted_signal_ends_the_block_and_a_second_one_does_at_once(num):
-    with pytest.raises(KeyboardInterrupt), signals.stop_on_signals((signals.CTRL_C,)) as is_interrupted:
+    with pytest.raises(KeyboardInterrupt), a2tg_jax.stop_on_signals((signal.SIGINT,)) as is_interrupted:
         assert not is_interrupted()
         for _ in range(num):
             signal.raise_signal(signal.SIGINT)
@@ -221,34 +222,35 @@ def test_quotas_of_control_groups(tmp_path, name):
     for path, text in {"proc/self/cgroup": groups, **{f"sys/fs/cgroup/{k}": v for k, v in files.items()}}.items():
         (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / path).write_text(text + "\n")
-    assert machine.cpu_quota(tmp_path) == expected
-    assert machine.cpu_quota(tmp_path / "nowhere") == math.inf
+    assert control_groups.cpu_quota(tmp_path) == expected
+    assert control_groups.cpu_quota(tmp_path / "nowhere") == math.inf
 
 
 @pytest.fixture
 def threads(monkeypatch):
     """Neither `set_num_threads` nor the environment has set a number of threads."""
-    monkeypatch.setattr(machine, "_chosen", None)
-    monkeypatch.delenv(machine.VARIABLE, raising=False)
+    monkeypatch.delenv("A2TG_NUM_THREADS", raising=False)
+    yield
+    a2tg_jax.set_num_threads(None)
 
 
 @pytest.mark.parametrize(("quota", "expected"), [(0.2, 1), (1.5, 2), (3.0, 3), (99.0, 8), (math.inf, 8)])
 def test_the_default_is_what_the_process_may_use(monkeypatch, threads, quota, expected):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(8), raising=False)
-    monkeypatch.setattr(machine, "cpu_quota", lambda: quota)
-    assert machine.num_threads() == expected
+    monkeypatch.setattr(threads_module, "cpu_quota", lambda: quota)
+    assert threads_module.num_threads() == expected
 
 
 def test_a_set_number_precedes_the_environment(monkeypatch, threads):
-    monkeypatch.setenv(machine.VARIABLE, "3")
+    monkeypatch.setenv("A2TG_NUM_THREADS", "3")
     for given, expected in ((5, 5), (None, 3)):
         a2tg_jax.set_num_threads(given)
-        assert machine.num_threads() == expected
+        assert threads_module.num_threads() == expected
     for wrong in (0, -1, 1.5, True, "2"):
         with pytest.raises(ValueError, match=r"num_threads must be a positive integer or None; got"):
             a2tg_jax.set_num_threads(wrong)
     for wrong in ("0", "-1", "two"):
-        monkeypatch.setenv(machine.VARIABLE, wrong)
+        monkeypatch.setenv("A2TG_NUM_THREADS", wrong)
         with pytest.raises(ValueError, match=rf"A2TG_NUM_THREADS must be a positive integer; got '{wrong}'"):
             a2tg_jax.configure_cpu(use_cache=False)
 

@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import json
 import pickle
+import tempfile
 import threading
 import time
 
@@ -16,7 +17,6 @@ from small_values import assert_same
 from test_data_transforms import write_points
 
 from a2tg_jax import Gaussians2dMcmc, Mcmc, Picture, fit, load_scene, synthetic_scene
-from a2tg_jax.data import photo_store
 from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.training import batches, loop
 from a2tg_jax.training.batches import Ahead, BatchOrder, PhotoStore
@@ -105,7 +105,7 @@ def test_training_gives_the_same_bits_wherever_photographs_are(tmp_path, monkeyp
     seen = []
     for scene in of_kind(tmp_path / "scene", "undistorted", None, 0):
         keep = lambda _: seen.append(num_readers())  # noqa: E731
-        models.append(fit(scene, SYSTEM, on_checkpoint=keep, progress=False).model)
+        models.append(fit(scene, SYSTEM, on_checkpoint=keep).model)
         assert seen.pop() > 0 == num_readers()
     assert_same(*(model.gaussians for model in models))
 
@@ -177,7 +177,7 @@ def test_a_photograph_that_does_not_stay_is_named(tmp_path, change):
     victim = folder / scene.train[2].name
     change(victim)
     with pytest.raises(ValueError, match=f"{victim.name}: (cannot be read|has changed since)"):
-        fit(scene, SYSTEM, progress=False)
+        fit(scene, SYSTEM)
     assert num_readers() == 0
 
 
@@ -227,7 +227,7 @@ def test_a_full_disk(monkeypatch):
     def full(**_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(photo_store.tempfile, "TemporaryFile", full)
+    monkeypatch.setattr(tempfile, "TemporaryFile", full)
     with pytest.raises(OSError, match=r"cannot keep the scene's photographs \(No space left.*larger downscale"):
         Shelf(0).keep(np.zeros((4, 4, 3), np.uint8))
 

@@ -172,8 +172,8 @@ def test_bytewise_resumes_between_two_of_its_times():
         "smoke", stage1_iterations=100, stage2_iterations=10, memory_budget="30kB", initial_gaussians=None
     )
     result, checkpoints = fit_keeping_checkpoints(scene, system, every=45)
-    again = a2tg.fit(scene, system, resume=checkpoints[0], progress=False)
+    again = a2tg.fit(scene, system, resume=checkpoints[0])
     assert bits_of(again.model) == bits_of(result.model)
     without = dataclasses.replace(system, place=PlaceByError(share=0.0))
     assert not any(isinstance(event, PlaceByError) for event in without.stages()[0].events)
-    assert bits_of(a2tg.fit(scene, without, progress=False).model) != bits_of(result.model)
+    assert bits_of(a2tg.fit(scene, without).model) != bits_of(result.model)

@@ -157,7 +157,7 @@ def test_others_grow_where_some_were_pruned(scene):
     assert result.stages[0].model.num == 30_000 * 90 // 100 // 56
     assert 0.995 * 30_000 <= result.model.num_bytes <= 30_000
     assert [int(one.state.iteration) for one in checkpoints[:2]] == [70, 140]
-    again = a2tg.fit(scene, SYSTEM, resume=checkpoints[1], progress=False)
+    again = a2tg.fit(scene, SYSTEM, resume=checkpoints[1])
     assert bits_of(again.model) == bits_of(result.model)
 
 
@@ -170,7 +170,7 @@ def test_plain_systems_prune_and_grow_again(scene, name):
         prune=Prune(share=0.3, at=(0.2, 0.3)),
     )  # fmt: skip
     assert not any(isinstance(event, Prune) for event in a2tg.find_system(name).stages()[0].events)
-    result = a2tg.fit(scene, system, progress=False)
+    result = a2tg.fit(scene, system)
     numbers = result.history.num_gaussians
     assert (np.diff(numbers) < 0).any() and result.model.num == 30_000 // 52
 

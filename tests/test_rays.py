@@ -266,6 +266,6 @@ def test_training_through_lenses_learns_and_prunes(kept):
         a2tg.Gaussians2dMcmc.preset("smoke"), stage1_iterations=60, initial_gaussians=200, sh_degree=0,
         prune=Prune(share=0.3, at=(0.5,)),
     )  # fmt: skip
-    result = a2tg.fit(mixed, system, progress=False)
+    result = a2tg.fit(mixed, system)
     assert np.mean(result.history.psnr[-2:]) > result.history.psnr[0] + 1
     assert result.model.num < 200 and np.isfinite(a2tg.evaluate(mixed.test, result.model).psnr)

@@ -12,35 +12,33 @@ from types import SimpleNamespace
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from PIL import Image
 from run_folders import NAMES, circle, create_run, some_history, some_result
+from small_models import with_bands
 
-from a2tg_jax import Appearance, Bands, Geometry, Model, RenderOutput, Texture, init_from_points, textures_from_arrays
-from a2tg_jax.appearance.parts import empty_bands
-from a2tg_jax.data.load import SceneSource
-from a2tg_jax.host.source_commit import source_commit
-from a2tg_jax.results.figures import (
-    TEXTURE_SIDE,
-    ReportFigure,
-    curves_figure,
-    depth_picture,
-    learned_textures,
-    level_colors,
-    level_maps,
-    normal_picture,
-    save_figure,
-    sizes_figure,
+from a2tg_jax import (
+    Appearance,
+    Geometry,
+    Model,
+    RenderOutput,
+    RenderSettings,
+    Texture,
+    init_from_points,
+    textures_from_arrays,
 )
+from a2tg_jax.data.load import SceneSource
+from a2tg_jax.results import figures
 from a2tg_jax.results.images import error_picture, largest_gain, side_by_side, to_uint8
 from a2tg_jax.results.report import Comparison, ModelResult, write_report
 from a2tg_jax.results.run_evaluation import is_split_by_number
 
 
-def written_report(folder, result, *, view="a", captions=("b",), figures=(), **options) -> str:
+def written_report(folder, result, *, view="a", captions=("b",), shown=(), **options) -> str:
     run = create_run(folder)
     run.own(run.point_cloud).touch()
     image = np.zeros((30, 40, 3), np.uint8)
-    comparison = Comparison.of(view, [image] * len(captions), captions, largest_gain(image, image, image))
-    places = dict.fromkeys(("curves", "textures", "maps", "geometry"), ()) | dict(figures)
+    comparison = Comparison.of(view, [image] * len(captions), captions, np.s_[:8, :8])
+    places = dict.fromkeys(("curves", "textures", "maps", "geometry"), ()) | dict(shown)
     write_report(run, result, [comparison], places, **options)
     return run.report.read_text(encoding="utf-8")
 
@@ -48,10 +46,10 @@ def written_report(folder, result, *, view="a", captions=("b",), figures=(), **o
 @pytest.fixture(scope="module")
 def report(tmp_path_factory) -> str:
     path = tmp_path_factory.mktemp("report") / "curves.png"
-    save_figure(path, curves_figure({"a": some_history()}, {"a": 0}))
-    figures = {"curves": [ReportFigure(path, "Curves.", "chart", [("#ff0000", "red")])]}
+    Image.new("RGB", (40, 30)).save(path)
+    shown = {"curves": [figures.ReportFigure(path, "Curves.", "chart", [("#ff0000", "red")])]}
     captions = ["photograph", "before", "after"]
-    return written_report(path.with_name("run"), some_result(), view="a<b.png", captions=captions, figures=figures)
+    return written_report(path.with_name("run"), some_result(), view="a<b.png", captions=captions, shown=shown)
 
 
 def test_report_is_one_self_contained_page(report):
@@ -147,26 +145,29 @@ def test_the_report_names_the_commit(tmp_path, monkeypatch):
         command = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b", *words]
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
+    def reported() -> str:
+        run = tmp_path / f"run{len(list(tmp_path.iterdir()))}"
+        return " ".join(written_report(run, some_result()).split())
+
     monkeypatch.setattr("a2tg_jax.host.source_commit.CHECKOUT", tmp_path)
     git("init")
-    assert source_commit() is None
+    (tmp_path / ".gitignore").write_text("run*")
+    assert "commit <code>" not in reported()
     (tmp_path / "a").write_text("1")
     git("add", "a")
     git("commit", "-m", "1")
     commit = git("rev-parse", "HEAD")
-    assert source_commit() == commit
+    assert f"commit <code>{commit}</code> (version" in reported()
     (tmp_path / "a").write_text("2")
-    assert source_commit() == f"{commit}-dirty"
-    report = written_report(tmp_path / "run", some_result())
-    assert f"commit <code>{commit}</code>, with local changes (version" in " ".join(report.split())
-    assert "<pre>pip install '.[train]'\na2tg train --config" in report
+    assert f"commit <code>{commit}</code>, with local changes (version" in reported()
+    assert "<pre>pip install '.[train]' a2tg train --config" in reported()
     monkeypatch.setattr("a2tg_jax.host.source_commit.CHECKOUT", tmp_path / "site-packages")
     for note, commit in (({"vcs_info": {"commit_id": "abc"}}, "abc"), ({"dir_info": {}}, None)):
         found = SimpleNamespace(read_text=lambda _, note=note: json.dumps(note))
         monkeypatch.setattr("a2tg_jax.host.source_commit.distribution", lambda _, found=found: found)
-        assert source_commit() == commit
+        assert (f"commit <code>{commit}</code>" in reported()) == (commit is not None)
     monkeypatch.setenv("A2TG_COMMIT", "of a copy")
-    assert source_commit() == "of a copy"
+    assert "commit <code>of a copy</code>" in reported()
 
 
 # Pictures of a model
@@ -184,78 +185,108 @@ def some_model(num: int = 4) -> Model:
     return Model(gaussians, Appearance(texture=Texture(textures)))
 
 
-def test_learned_textures_are_shown_as_their_gaussians_wear_them():
-    sheet = learned_textures(some_model())
-    assert sheet is not None and sheet.shape == (TEXTURE_SIDE, 2 * TEXTURE_SIDE + 8, 4)
+def shown(alpha, depth, normal=None) -> RenderOutput:
+    """A render of which only these are read."""
+    return RenderOutput(0.0, jnp.asarray(alpha), None, Geometry(jnp.asarray(depth), normal, None))
+
+
+HISTORIES = {NAMES[0]: some_history(1), NAMES[1]: some_history(2), NAMES[2]: some_history(2)}
+
+
+@pytest.fixture
+def figures_of(tmp_path, monkeypatch):
+    """Figures of a report by file name: pictures with their legends, and plots. The model's render is a stand-in."""
+
+    def written(model, output=None):
+        camera = circle(1)[0]
+        ones = np.ones((camera.height, camera.width))
+        seen = output or shown(ones, ones, np.zeros((*ones.shape, 3)))
+        plots = {}
+        monkeypatch.setattr(figures, "Renderer", lambda *_, **__: lambda camera: seen)
+        monkeypatch.setattr(figures, "save_figure", lambda path, figure: plots.update({path.name: figure}))
+        run = create_run(tmp_path / str(len(list(tmp_path.iterdir()))))
+        starts = {NAMES[0]: 0, NAMES[1]: 60, NAMES[2]: 60}
+        places = figures.write_figures(run, model, camera, RenderSettings(), HISTORIES, starts)
+        made = {}
+        for figure in [*places["textures"], *places["maps"], *places["geometry"]]:
+            if figure.path.is_file():
+                made[figure.path.name] = np.asarray(Image.open(figure.path)), figure.legend
+        return made | plots
+
+    return written
+
+
+def test_learned_textures_are_shown_as_their_gaussians_wear_them(figures_of):
+    sheet, _ = figures_of(some_model())["textures.png"]
+    assert sheet.shape == (64, 2 * 64 + 8, 4)
     shapes = {tuple(np.argwhere(part[..., 3]).max(axis=0) + 1) for part in (sheet[:, :64], sheet[:, 72:])}
     assert shapes == {(32, 64), (64, 32)}  # in their own proportions
     wide = next(part for part in (sheet[:, :64], sheet[:, 72:]) if part[0, 63, 3])
     assert wide[0, 0].tolist() == [255, 128, 128, 255] and wide[0, 63].tolist() == [128, 128, 128, 255]
     tall = next(part for part in (sheet[:, :64], sheet[:, 72:]) if part[63, 0, 3])
     assert {int(grey) for grey in tall[:16, :32, 0].ravel()} == {140, 191}  # transparent: the chequered ground
-    model, textures = some_model(), textures_from_arrays([np.ones((1, 1, 4), np.float32)] * 4)
-    assert learned_textures(Model(model.gaussians)) is learned_textures(model.with_textures(textures)) is None
 
 
-def shown(alpha, depth, normal=None) -> RenderOutput:
-    """A render of which only these are read."""
-    return RenderOutput(None, jnp.asarray(alpha), None, Geometry(jnp.asarray(depth), normal, None))
-
-
-def test_depth_and_normals_are_pictures():
+def test_depth_and_normals_are_pictures(figures_of):
     camera = circle(1)[0]
     alpha = np.ones((camera.height, camera.width), np.float32)
     alpha[:, :5] = 0.1
     depth = alpha * np.linspace(1, 3, camera.height, dtype=np.float32)[:, None]
     towards = -np.asarray(camera.viewmat)[2, :3]
     normal = alpha[..., None] * towards
-    output = shown(alpha, depth, normal)
-    seen, stops = depth_picture(output)
+    made = figures_of(Model(some_model().gaussians), shown(alpha, depth, normal))
+    seen, stops = made["depth.png"]
+    normals, _ = made["normals.png"]
     assert seen[0, -1].sum() > seen[-1, -1].sum()
-    distances = [distance for distance, _ in stops]
+    distances = [float(distance) for _, distance in stops]
     assert distances == sorted(distances) and 1 < distances[0] < 1.1 and 2.7 < distances[-1] < 3
-    normals = normal_picture(output, camera)
     assert np.abs(normals[:, 5:] - np.array([128.0, 128.0, 255.0])).max() <= 1
     for picture in (seen, normals):
         assert {tuple(color) for color in picture[:, :5].reshape(-1, 3)} == {(140,) * 3, (191,) * 3}
 
 
 @pytest.mark.parametrize(("share", "factor"), [(0.2, 1000), (0.04, 0.01)], ids=["far", "near"])
-def test_outliers_leave_the_colours_of_depth_to_the_scene(share, factor):
+def test_outliers_leave_the_colours_of_depth_to_the_scene(figures_of, share, factor):
     """A far background, and splats before the camera."""
     depth = np.broadcast_to(np.linspace(1, 3, 100, dtype=np.float32), (100, 100)).copy()
     depth[: round(100 * share)] *= factor
-    colors = depth_picture(shown(np.ones_like(depth), depth))[0][-1].astype(int)
+    output = shown(np.ones_like(depth), depth, np.zeros((100, 100, 3)))
+    colors = figures_of(Model(some_model().gaussians), output)["depth.png"][0][-1].astype(int)
     assert np.abs(colors[5] - colors[94]).max() > 150
-    nothing = jnp.zeros((4, 4))
-    assert depth_picture(shown(nothing, nothing))[0].shape == (4, 4, 3)
 
 
-def test_maps_show_what_varies_between_gaussians():
-    def legends(model: Model) -> dict[str, list[str]]:
-        return {file: names for file, _, _, names in level_maps(model)}
+def test_where_nothing_is_hit_there_is_still_a_picture(figures_of):
+    nothing = np.zeros((4, 4))
+    made = figures_of(Model(some_model().gaussians), shown(nothing, nothing, np.zeros((4, 4, 3))))
+    assert made["depth.png"][0].shape == made["normals.png"][0].shape == (4, 4, 3)
 
+
+def test_maps_show_what_varies_between_gaussians(figures_of):
     textured = some_model()
-    assert legends(textured) == {"resolutions.png": ["1 or none", "2", "4", "8"]}
-    for side in (1, 4):
-        alike = textures_from_arrays([np.ones((side, side, 4), np.float32)] * 4)
-        assert legends(textured.with_textures(alike)) == {}
+    sizes = {"textures.png", "sizes.png"}
+    of_size = {side: textures_from_arrays([np.ones((side, side, 4), np.float32)] * 4) for side in (1, 4)}
     gaussians = init_from_points(np.eye(3, dtype=np.float32) / 2, np.full((3, 3), 0.5), sh_degree=0)
-    banded = Model(gaussians, Appearance(bands=Bands(empty_bands([0, 2, 1], 0))))
-    assert legends(banded) == {"degrees.png": ["0", "1", "2"]}
+    cases = [
+        (textured, sizes | {"resolutions.png"}, ["1 or none", "2", "4", "8"]),
+        (textured.with_textures(of_size[1]), set(), None),
+        (textured.with_textures(of_size[4]), {"sizes.png"}, None),
+        (with_bands(Model(gaussians), np.zeros((3, 8, 3)), [0, 2, 1]), {"degrees.png"}, ["0", "1", "2"]),
+    ]
+    for model, files, names in cases:
+        made = figures_of(model)
+        assert made.keys() == files | {"curves.png", "depth.png", "normals.png"}
+        for file in files & {"resolutions.png", "degrees.png"}:
+            colors, meanings = zip(*made[file][1], strict=True)
+            assert [*meanings] == names and len(set(colors)) == len(names)
 
 
-def test_figures_are_drawn_within_their_canvas(tmp_path):
-    histories = {NAMES[0]: some_history(1), NAMES[1]: some_history(2), NAMES[2]: some_history(2)}
-    sizes = np.array([(0, 0)] * 187_000 + [(2, 2)] * 3_000)
-    curves = curves_figure(histories, {NAMES[0]: 0, NAMES[1]: 60, NAMES[2]: 60})
-    for name, figure in {"curves": curves, "sizes": sizes_figure(sizes)}.items():
-        save_figure(tmp_path / f"{name}.png", figure)
-        assert (tmp_path / f"{name}.png").stat().st_size > 1000
-        box = figure.axes[0].title.get_window_extent()
-        assert box.x0 >= 0 and box.x1 <= figure.bbox.x1
-    colors = level_colors(5)
-    assert colors.shape == (5, 3) and len(np.unique(colors, axis=0)) == 5 and level_colors(1).shape == (1, 3)
+def test_figures_are_drawn_within_their_canvas(figures_of, tmp_path):
+    made = figures_of(some_model())
+    for name in ("curves.png", "sizes.png"):
+        made[name].savefig(tmp_path / name, format="png", dpi=110)
+        assert (tmp_path / name).stat().st_size > 1000
+        box = made[name].axes[0].title.get_window_extent()
+        assert box.x0 >= 0 and box.x1 <= made[name].bbox.x1
 
 
 def test_largest_gain_finds_the_square_and_leaves_out_where_both_fail():

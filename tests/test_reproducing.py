@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from a2tg_jax.base.machine import Machine, this_machine
+from a2tg_jax.base.machine import this_machine
 from a2tg_jax.rasterize.kernels import platforms
 
 
@@ -26,7 +26,7 @@ def test_kernels_with_atomic_sums_are_not_chosen_where_xla_is_to_be_deterministi
 def test_what_may_change_bits_is_reported():
     here = this_machine()
     assert here.differences(here) == []
-    other = Machine("0.1", here.jaxlib, "gpu: other", here.processor, here.threads + 1)
+    other = dataclasses.replace(here, jax="0.1", device="gpu: other", threads=here.threads + 1)
     assert [printed.split(" is ")[0] for printed in other.differences(here)[:2]] == ["jax", "device"]
     assert "A2TG_NUM_THREADS=" in other.differences(here)[2]
     on_gpu = dataclasses.replace(here, device="gpu: other")

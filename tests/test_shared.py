@@ -194,7 +194,7 @@ def test_a_field_without_rows_is_named_before_training():
     with pytest.raises(
         ValueError, match=r"Unshared\.weights must have a row for each Gaussian; .*a2tg_jax\.shared\(\)"
     ):
-        a2tg.fit(scene, Own(shown="unshared", sh_degree=0), progress=False)
+        a2tg.fit(scene, Own(shown="unshared", sh_degree=0))
 
 
 @pytest.mark.parametrize("kind", ["painted", "codebook"])
@@ -235,7 +235,7 @@ def test_training_with_events_learns_and_resumes(events, tmp_path):
             a2tg.save_checkpoint(path, checkpoint)
             kept.append(jax.device_get(checkpoint.state.moments))
 
-    result = a2tg.fit(scene, system, progress=False, on_checkpoint=save, checkpoint_every=25)
+    result = a2tg.fit(scene, system, on_checkpoint=save, checkpoint_every=25)
     history = result.history
     network = result.model.appearance.network
     assert history.loss[-1] < 0.8 * history.loss[0] and (history.num_gaussians != 50).any()
@@ -243,13 +243,13 @@ def test_training_with_events_learns_and_resumes(events, tmp_path):
     resume = a2tg.load_checkpoint(path, Own)
     assert_same(resume.state.moments, kept[0])
     assert all(map(np.any, jax.tree.leaves(kept[0].mu.appearance.network)))
-    assert_same(a2tg.fit(scene, system, progress=False, resume=resume).model, result.model)
+    assert_same(a2tg.fit(scene, system, resume=resume).model, result.model)
 
 
 def test_a_field_learns_at_a_rate_of_its_own():
     scene = a2tg.synthetic_scene(num_views=3, width=16, height=16, num_points=50)
     still, learned = (
-        a2tg.fit(scene, Own(sh_degree=0, stage1_iterations=3, shared_rate=rate), progress=False).model.appearance
+        a2tg.fit(scene, Own(sh_degree=0, stage1_iterations=3, shared_rate=rate)).model.appearance
         for rate in (0.0, 1e-2)
     )
     assert float(still.network["gain"]) == 0 != float(learned.network["gain"]) and np.any(still.codes)

@@ -92,4 +92,4 @@ def test_points_that_no_view_sees_are_refused():
     scene = a2tg.synthetic_scene(num_views=4, width=24, height=16, num_points=50)
     lost = dataclasses.replace(scene, points=scene.points + np.float32([0, 0, 1000]))
     with pytest.raises(ValueError, match=r"scene\.points: no training view sees any of the 50 points: .*transform"):
-        a2tg.fit(lost, a2tg.Gaussians2dMcmc(stage1_iterations=1), progress=False)
+        a2tg.fit(lost, a2tg.Gaussians2dMcmc(stage1_iterations=1))

@@ -23,8 +23,16 @@ from a2tg_jax.training.registry import system_from_dict, system_to_dict
 from a2tg_jax.training.start import initial_model
 from a2tg_jax.training.step import jitted_step
 
-BUDGETS = {"textured-gaussians": "39.1kB", "supergaussians": "27.3kB", "bbsplat": "346kB"}
-"""Room for 80 Gaussians; the other systems have budgets in `test_budget`."""
+BUDGETS = {
+    "gaussians-2d": "18.6kB",
+    "gaussians-2d-mcmc": "18.6kB",
+    "textured-gaussians": "39.1kB",
+    "supergaussians": "27.3kB",
+    "bbsplat": "346kB",
+    "a2tg": "31kB",
+}
+"""Room for 80 Gaussians, such that what is less than one more is less than half a percent; for more with textures of
+several sizes. `bytewise` has a budget in `test_bytewise`."""
 TINY = {"stage1_iterations": 24, "initial_gaussians": 60, "densify": {"cap": 80}}
 
 
@@ -77,10 +85,10 @@ def check_run(scene, system, folder, every: int = 8):
         if num_saved == 2:
             a2tg.save_checkpoint(path, checkpoint)
 
-    result = a2tg.fit(scene, system, on_checkpoint=keep, checkpoint_every=every, progress=False)
+    result = a2tg.fit(scene, system, on_checkpoint=keep, checkpoint_every=every)
     resume = a2tg.load_checkpoint(path)
     assert resume.iteration == 2 * every
-    assert_same(a2tg.fit(scene, system, resume=resume, progress=False).model, result.model)
+    assert_same(a2tg.fit(scene, system, resume=resume).model, result.model)
     a2tg.save_model(folder / "model.npz", result.model)
     loaded = a2tg.load_model(folder / "model.npz")
     view = scene.test[0]
@@ -97,7 +105,7 @@ def test_every_system_trains_resumes_saves_and_renders(scene, tmp_path, name):
     history = result.history
     if system.memory_budget is not None:
         assert history.megabytes.max() <= system.memory_budget
-        assert 0.995 * system.budget_bytes <= result.model.num_bytes
+        assert 0.995 * system.budget_bytes <= result.model.num_bytes <= system.budget_bytes
     assert np.isfinite(history.loss).all() and history.loss[-1] < history.loss[0]
     assert [stage.name for stage in result.stages] == [stage.name for stage in system.stages()]
 
@@ -125,9 +133,9 @@ def test_a_toy_of_one_file_does_all_that_the_others_do(scene, tmp_path):
     result = check_run(scene, system, tmp_path, every=5)
     rings = np.asarray(result.model.appearance.rings)
     assert np.abs(rings[:, :3]).max() > 1e-3, "the appearance's numbers are trained"
-    start = a2tg.fit(scene, dataclasses.replace(system, factor=1.0), progress=False).model.gaussians
+    start = a2tg.fit(scene, dataclasses.replace(system, factor=1.0)).model.gaussians
     assert result.model.gaussians.log_scales.mean() < start.log_scales.mean() - 0.05, "the event shrinks"
-    heavy = a2tg.fit(scene, dataclasses.replace(system, contrast_weight=100.0), progress=False).model
+    heavy = a2tg.fit(scene, dataclasses.replace(system, contrast_weight=100.0)).model
     assert np.square(heavy.appearance.rings[:, :3]).mean() < 0.2 * np.square(rings[:, :3]).mean(), "the term weighs"
     assert result.model.num_bytes == 4 * (58 + 4) * result.model.num
 
@@ -138,8 +146,8 @@ def test_textures_of_one_texel_that_do_not_learn_change_nothing(scene):
     """They stay (0, 0, 0, 1), and the Gaussians are those of a stage without textures."""
     plain = tiny("gaussians-2d-mcmc")
     textured = tiny("a2tg", texture={"fraction": 0.0}, single_texel_rate=0.0)
-    first = fit_stage(scene, plain, 0, progress=False).model
-    expected, found = (fit_stage(scene, one, 1, first, progress=False).model for one in (plain, textured))
+    first = fit_stage(scene, plain, 0).model
+    expected, found = (fit_stage(scene, one, 1, first).model for one in (plain, textured))
     (texels,) = found.textures.buckets
     np.testing.assert_array_equal(texels[: found.num], np.broadcast_to([0, 0, 0, 1], (found.num, 1, 1, 4)))
     for a, b in zip(jax.tree.leaves(found.gaussians), jax.tree.leaves(expected.gaussians), strict=True):
@@ -149,7 +157,7 @@ def test_textures_of_one_texel_that_do_not_learn_change_nothing(scene):
 @pytest.mark.long
 def test_textures_that_have_grown_learn_though_those_of_one_texel_do_not(scene):
     system = tiny("a2tg", texture={"fraction": 0.5, "at": [0.5]}, single_texel_rate=0.0)
-    model = a2tg.fit(scene, system, progress=False).model
+    model = a2tg.fit(scene, system).model
     for (height, width), bucket in zip(model.textures.bucket_sizes, model.textures.buckets, strict=True):
         is_neutral = bool((bucket == jnp.asarray([0, 0, 0, 1], bucket.dtype)[None, None, None]).all())
         assert is_neutral == (height * width == 1)
@@ -222,7 +230,7 @@ def test_the_host_waits_once_for_many_steps(scene, monkeypatch):
         return device_get(value)
 
     monkeypatch.setattr(jax, "device_get", noted)
-    a2tg.fit(scene, a2tg.Gaussians2dMcmc(stage1_iterations=25, densify=a2tg.Mcmc(cap=60)), progress=False)
+    a2tg.fit(scene, a2tg.Gaussians2dMcmc(stage1_iterations=25, densify=a2tg.Mcmc(cap=60)))
     assert waits == [10, 10, 5]
 
 
@@ -248,9 +256,9 @@ def test_gaussians_that_find_no_room_are_counted_and_reported(scene, tmp_path):
             a2tg.save_checkpoint(tmp_path / "late.npz", checkpoint)
 
     with pytest.warns(UserWarning, match=r"no room for a Gaussian .* raise densify.cap") as whole:
-        a2tg.fit(scene, system, progress=False, on_checkpoint=keep, checkpoint_every=1)
+        a2tg.fit(scene, system, on_checkpoint=keep, checkpoint_every=1)
     with pytest.warns(UserWarning, match="no room for a Gaussian") as resumed:
-        a2tg.fit(scene, system, progress=False, resume=a2tg.load_checkpoint(tmp_path / "late.npz"))
+        a2tg.fit(scene, system, resume=a2tg.load_checkpoint(tmp_path / "late.npz"))
     assert [str(one.message) for one in whole] == [str(one.message) for one in resumed]
 
 
@@ -265,7 +273,7 @@ def test_a_training_without_gaussians_left_says_what_to_change(scene, name, reas
     system = tiny(name, initial_opacity=0.001, rates={"logit_opacities": 0.0})
     advice = "check the cameras and points of the scene, or lower rates.logit_opacities"
     with pytest.raises(ValueError, match=rf"^training cannot continue at iteration \d+ .*: .*{reason}; {advice}$"):
-        a2tg.fit(scene, system, progress=False)
+        a2tg.fit(scene, system)
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
@@ -410,7 +418,7 @@ def test_a_sweep_compiles_each_step_once(scene, name, event, thresholds):
         merged = {key: {**fixed.get(key, {}), **changes.get(key, {})} for key in ("loss", "texture")}
         merged = {**changes, **{key: value for key, value in merged.items() if value}}
         with compiled_programs("train_step") as programs:
-            result = a2tg.fit(scene, tiny(name, **merged), progress=False, session=session)
+            result = a2tg.fit(scene, tiny(name, **merged), session=session)
         # Lists that grow in the middle of a run are compiled again; a run records how often that was.
         count = max(0, len(programs) - result.num_regrown)
         counts.append((count, session.room == rooms))

@@ -42,7 +42,7 @@ from a2tg_jax import (
     synthetic_scene,
     view_image,
 )
-from a2tg_jax.core.table import Shape
+from a2tg_jax.core.table import Layout
 from a2tg_jax.training import loop
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.start import initial_model, padded
@@ -98,7 +98,7 @@ def test_a_second_or_resumed_run_is_the_same(scene, trained, tmp_path, place):
     if place is not None:
         save_checkpoint(tmp_path / "checkpoint.npz", checkpoints[place])
         resume = load_checkpoint(tmp_path / "checkpoint.npz")
-    assert_same(fit(scene, CONFIG, resume=resume, progress=False), result)
+    assert_same(fit(scene, CONFIG, resume=resume), result)
 
 
 @pytest.mark.long
@@ -106,9 +106,9 @@ def test_what_ran_before_in_the_process_changes_nothing(scene, trained):
     """Runs in between leave larger tile lists, other buckets of textures, other programs, another seed's orders."""
     before = trained[0]
     texture = Upscale(at=(0.5,), cap=8, fraction=0.9)
-    other = fit(scene, dataclasses.replace(CONFIG, densify=Mcmc(cap=150), texture=texture, seed=4), progress=False)
-    fit(scene, Gaussians2d(stage1_iterations=20, densify=CloneSplitPrune(cap=200), batch_size=2), progress=False)
-    again = fit(scene, CONFIG, progress=False)
+    other = fit(scene, dataclasses.replace(CONFIG, densify=Mcmc(cap=150), texture=texture, seed=4))
+    fit(scene, Gaussians2d(stage1_iterations=20, densify=CloneSplitPrune(cap=200), batch_size=2))
+    again = fit(scene, CONFIG)
     assert bits_of(again.model) == bits_of(before.model)
     jax.tree.map(np.testing.assert_array_equal, again.stages[0].model, before.stages[0].model)
     np.testing.assert_array_equal(again.history.loss, before.history.loss)
@@ -128,14 +128,14 @@ def test_a_stop_between_any_two_steps_changes_nothing(scene, trained, tmp_path, 
     rows = []
     with pytest.raises(Interrupted, match=f"of stage {stage + 1}; the model is error.checkpoint.model") as stopped:
         is_stopped = lambda: next(left, None) is None  # noqa: E731
-        fit(scene, CONFIG, on_checkpoint=keep, on_log=rows.append, progress=False, is_stopped=is_stopped)
+        fit(scene, CONFIG, on_checkpoint=keep, on_log=rows.append, is_stopped=is_stopped)
     assert kept[-1][0] == stage and 0 < kept[-1][1] < 20 and kept[-1][1] % 10
     saved = load_checkpoint(tmp_path / "checkpoint.npz")
     history = stopped.value.checkpoint.history.to_dict()
     jax.tree.map(np.testing.assert_array_equal, stopped.value.checkpoint.model, saved.model)
     last = [row for row in rows if row["stage"] == stage + 1]
     assert {name: [row[name] for row in last] for name in history} == jax.tree.map(list, history)
-    assert_same(fit(scene, CONFIG, resume=load_checkpoint(tmp_path / "checkpoint.npz"), progress=False), trained[0])
+    assert_same(fit(scene, CONFIG, resume=load_checkpoint(tmp_path / "checkpoint.npz")), trained[0])
 
 
 @pytest.mark.long
@@ -144,11 +144,11 @@ def test_shapes_of_earlier_runs_change_nothing(scene, tmp_path, request):
     if passes_in_its_own_process(request):
         return
     start = initial_model(scene, CONFIG)
-    whole = fit_stage(scene, CONFIG, 1, start, progress=False)
+    whole = fit_stage(scene, CONFIG, 1, start)
     textures = whole.model.textures
     session = Session()
     capacities = (*(len(bucket) + 2 for bucket in textures.buckets), 1)
-    session.shapes.add(Shape((*textures.bucket_sizes, (5, 5)), capacities))
+    session.layouts.add(Layout((*textures.bucket_sizes, (5, 5)), capacities))
     path = tmp_path / "checkpoint.npz"
     rooms = []
 
@@ -157,10 +157,9 @@ def test_shapes_of_earlier_runs_change_nothing(scene, tmp_path, request):
             save_checkpoint(path, checkpoint)
             rooms.append(tuple(map(len, checkpoint.state.model.textures.buckets)))
 
-    options = {"progress": False, "session": session}
-    assert_same(fit_stage(scene, CONFIG, 1, start, on_checkpoint=keep, checkpoint_every=8, **options), whole)
+    assert_same(fit_stage(scene, CONFIG, 1, start, on_checkpoint=keep, checkpoint_every=8, session=session), whole)
     assert rooms == [capacities]
-    assert_same(fit_stage(scene, CONFIG, 1, resume=load_checkpoint(path), **options), whole)
+    assert_same(fit_stage(scene, CONFIG, 1, resume=load_checkpoint(path), session=session), whole)
 
 
 @pytree
@@ -211,10 +210,10 @@ def test_what_is_passed_in_stays_usable(scene, trained):
     result, checkpoints, _ = trained
     first = result.stages[0].model
     before = jax.tree.map(np.array, first)
-    assert_same(fit_stage(scene, CONFIG, 1, first, progress=False), result)
+    assert_same(fit_stage(scene, CONFIG, 1, first), result)
     jax.tree.map(np.testing.assert_array_equal, first, before)
     for _ in range(2):
-        assert_same(fit(scene, CONFIG, resume=checkpoints[-2], progress=False), result)
+        assert_same(fit(scene, CONFIG, resume=checkpoints[-2]), result)
 
 
 @pytest.mark.long
@@ -259,7 +258,7 @@ def test_a_budget_that_the_model_exceeds_is_refused(scene, trained):
     system = dataclasses.replace(CONFIG, texture=Upscale(select="budget", budget_mb=0.001))
     message = r"stage 'textures': Upscale\.apply: .*budget of 0.001 MB is below the 0.027 MB"
     with pytest.raises(ValueError, match=message):
-        fit_stage(scene, system, 1, trained[0].stages[0].model, progress=False)
+        fit_stage(scene, system, 1, trained[0].stages[0].model)
 
 
 def with_picture(view, picture):
@@ -279,23 +278,23 @@ def with_picture(view, picture):
 def test_damaged_scenes_are_refused(scene, change, message):
     with pytest.raises(ValueError, match=message):
         changed = {name: function(getattr(scene, name)) for name, function in change.items()}
-        fit(dataclasses.replace(scene, **changed), CONFIG, progress=False)
+        fit(dataclasses.replace(scene, **changed), CONFIG)
 
 
 def test_wrong_arguments_of_fit_are_refused(scene, trained):
     checkpoint = trained[1][-1]
     with pytest.raises(ValueError, match=rf"another configuration \(seed {CONFIG.seed}, not 4\): resume"):
-        fit(scene, dataclasses.replace(CONFIG, seed=4), resume=checkpoint, progress=False)
+        fit(scene, dataclasses.replace(CONFIG, seed=4), resume=checkpoint)
     with pytest.raises(ValueError, match=r"another configuration \(A2tg, not Gaussians2dMcmc\)"):
-        fit(scene, Gaussians2dMcmc(stage1_iterations=4), resume=checkpoint, progress=False)
+        fit(scene, Gaussians2dMcmc(stage1_iterations=4), resume=checkpoint)
     with pytest.raises(ValueError, match="checkpoint_every must be at least 1; got 0"):
-        fit(scene, CONFIG, checkpoint_every=0, progress=False)
+        fit(scene, CONFIG, checkpoint_every=0)
     with pytest.raises(
         ValueError, match=r"^progress must be None, or a class such as a2tg_jax\.ProgressBar; got True$"
     ):
         fit(scene, CONFIG, progress=True)
     with pytest.raises(ValueError, match=r"index must be in 0\.\.1"):
-        fit_stage(scene, CONFIG, 2, progress=False)
+        fit_stage(scene, CONFIG, 2)
 
 
 @pytest.mark.long
@@ -304,7 +303,7 @@ def test_views_of_two_sizes(scene):
     larger = synthetic_scene(num_views=8, width=48, height=30, num_points=150).train
     mixed = dataclasses.replace(scene, train=(scene.train[0], larger[1], scene.train[2]))
     config = Gaussians2dMcmc(stage1_iterations=6, batch_size=3, initial_gaussians=100, densify=Mcmc(cap=40))
-    result = fit(mixed, config, progress=False)
+    result = fit(mixed, config)
     assert result.model.num == 40 and np.isfinite(result.history.loss).all()
 
 
@@ -339,7 +338,7 @@ def test_the_history_has_the_loss_by_term(scene):
 
     logged = []
     system = Own(stage1_iterations=11, stage2_iterations=0, initial_gaussians=60, densify=Mcmc(cap=60))
-    history = fit(scene, system, on_log=logged.append, progress=False).history
+    history = fit(scene, system, on_log=logged.append).history
     names = ["l1", "ssim", "opacity", "roughness", "lambda", "lambda_5"]
     assert set(history.terms) == {*names} and len(history.loss) == 2
     np.testing.assert_allclose(sum(history.terms[name] for name in names), history.loss, rtol=1e-6)
@@ -347,7 +346,7 @@ def test_the_history_has_the_loss_by_term(scene):
     np.testing.assert_array_equal(history.terms["lambda_5"], 0.25)
     assert logged[1]["loss_roughness"] == history.to_dict()["loss_roughness"][1] > 0
     start = initial_model(scene, system)
-    first = fit_stage(scene, dataclasses.replace(system, stage1_iterations=1), 0, start, progress=False).history
+    first = fit_stage(scene, dataclasses.replace(system, stage1_iterations=1), 0, start).history
     np.testing.assert_allclose(first.terms["opacity"], [0.01 * np.mean(start.gaussians.opacities)], rtol=1e-5)
     (view,) = [view for view in scene.train if abs(_l1(start, view) * 0.8 - first.terms["l1"][0]) < 1e-6]
     similarity = ssim(start.render(view.camera).color, view_image(view, (0, 0, 0)))

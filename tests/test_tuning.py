@@ -31,7 +31,6 @@ from a2tg_jax import (
 from a2tg_jax.finish import tuning
 from a2tg_jax.finish.compaction import TooLargeError
 from a2tg_jax.finish.tuning import (
-    MOST_TUNINGS,
     TUNED_LADDER,
     GradualRounding,
     GridRounding,
@@ -281,7 +280,7 @@ def test_the_search(monkeypatch, losses, max_loss, tolerances, kept):
     np.testing.assert_allclose(tried, tolerances)
     assert started == ["model", 1, 2, 3][: len(started)]
     assert found.diverged == ("the loss has exploded" if "diverges" in losses else None)
-    assert len(found.tried) == (2 if found.diverged else MOST_TUNINGS)
+    assert len(found.tried) == (2 if found.diverged else 4)
     assert found.tuned is None if kept is None else (found.tuned.model, found.chosen) == (kept + 1, found.tried[kept])
 
 

@@ -16,6 +16,7 @@ from small_values import some_gaussians
 from a2tg_jax import (
     AdaptDegrees,
     Appearance,
+    Camera,
     Due,
     Exponents,
     Gaussians2dMcmc,
@@ -36,15 +37,18 @@ from a2tg_jax import (
     save_model,
     save_ply,
 )
-from a2tg_jax.appearance.parts import empty_bands, floats_of_band, sizes_of_degrees
-from a2tg_jax.core.budget import within_budget
-from a2tg_jax.core.table import Shape, bucket_capacity, resize
-from a2tg_jax.densify.view_dependence import BandStatistics, most_blocks, raised_degrees, without_idle
+from a2tg_jax.core.table import Layout, bucket_capacity, resize
+from a2tg_jax.densify.view_dependence import most_blocks
 from a2tg_jax.training.start import padded
 
 NUM = 40
 NUM_FLOATS = (13, 22, 37, 58)
 """Of a Gaussian of degree 0 to 3."""
+
+
+def sizes_of(degrees: np.ndarray, base: int) -> np.ndarray:
+    """Coefficients [N, 1] above the degree that all have."""
+    return (degrees[:, None] + 1) ** 2 - (base + 1) ** 2
 
 
 def random_degrees(seed: int, base: int = 0) -> np.ndarray:
@@ -159,7 +163,7 @@ def test_other_degrees_keep_what_a_gaussian_keeps(seed):
     model, plain, _ = banded(seed)
     ones = jax.tree.map(jnp.ones_like, partition(model)[0])
     degrees = random_degrees(seed + 20)
-    table, ones = resize(model.appearance.coefficients, sizes_of_degrees(degrees, 0), ones)
+    table, ones = resize(model.appearance.coefficients, sizes_of(degrees, 0), ones)
     changed = dataclasses.replace(model, appearance=model.appearance.with_coefficients(table))
     np.testing.assert_array_equal(changed.degrees, degrees)
     both = np.minimum(degrees, model.degrees)
@@ -175,7 +179,14 @@ def test_the_gradient_of_missing_coefficients_is_that_of_coefficients_that_are_z
     centers = rng.normal(size=(6, 3)) + 5
     colors = rng.normal(size=(6, NUM, 3)).astype(np.float32)
     as_array = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
-    state = BandStatistics.init(NUM).observe(as_array(means), as_array(centers), as_array(colors))
+    model = Model(dataclasses.replace(some_gaussians(NUM), means=as_array(means)))
+    viewmats = np.tile(np.eye(4), (6, 1, 1))
+    viewmats[:, :3, 3] = -centers
+    cameras = Camera(as_array(viewmats), jnp.tile(jnp.eye(3), (6, 1, 1)), 4, 3)
+    nothing = jnp.zeros((6, NUM, 3))
+    event = AdaptDegrees(1.0)
+    seen = Seen(cameras, nothing, nothing[..., 0] > 0, as_array(colors))
+    state = event.observe(event.init(model), model, seen)
     expected = np.zeros((NUM, 16, 3))
     for center, color in zip(centers, colors, strict=True):
         for i in range(NUM):
@@ -186,25 +197,32 @@ def test_the_gradient_of_missing_coefficients_is_that_of_coefficients_that_are_z
     np.testing.assert_allclose(state.strengths(), np.stack(norms, 1), rtol=1e-4)
 
 
+def degrees_after(degrees, dense, strengths, budget, **options):
+    """Degrees that an event with some bytes to spend leaves, given average gradients by the bands of degree 1 to 3."""
+    num = len(degrees)
+    gaussians = some_gaussians(num)
+    model = with_bands(Model(dataclasses.replace(gaussians, sh=gaussians.sh[:, :1])), dense, degrees)
+    event = AdaptDegrees((model.num_bytes + budget) / 1e6, **options)
+    total = np.zeros((num, 16, 3), np.float32)
+    total[:, [1, 4, 9], 0] = strengths
+    state = dataclasses.replace(event.init(model), total=jnp.asarray(total), views=jnp.int32(1))
+    return event.apply(Due(), model, adam_init(partition(model)[0]), state).model.degrees
+
+
 def test_degrees_rise_where_the_gradient_per_byte_is_largest():
     degrees = np.array([0, 0, 1, 2, 3])
     strengths = np.array([[4.0, 9, 9], [3.0, 9, 9], [9, 6.0, 9], [9, 9, 6.0], [9, 9, 9]])
     # Per byte: 4/36, 3/36, 6/60, 6/84; the last has all.
-    np.testing.assert_array_equal(raised_degrees(degrees, strengths, 36), [1, 0, 1, 2, 3])
-    np.testing.assert_array_equal(raised_degrees(degrees, strengths, 96), [1, 0, 2, 2, 3])
-    np.testing.assert_array_equal(raised_degrees(degrees, strengths, 1000), [1, 1, 2, 3, 3])
-    np.testing.assert_array_equal(raised_degrees(degrees, strengths, 0), degrees)
-    assert not within_budget(np.ones(3), np.ones(3, bool), np.full(3, 16), 0).any()
+    for budget, wanted in ((36, [1, 0, 1, 2, 3]), (96, [1, 0, 2, 2, 3]), (1000, [1, 1, 2, 3, 3]), (0, degrees)):
+        np.testing.assert_array_equal(degrees_after(degrees, np.ones((5, 15, 3)), strengths, budget), wanted)
 
 
 def test_idle_bands_are_given_up():
     degrees = np.array([0, 1, 1, 2])
     dense = np.zeros((4, 15, 3), np.float32)
     dense[2, :3] = dense[3, :3] = 1.0
-    gaussians = some_gaussians(4)
-    bands = with_bands(Model(dataclasses.replace(gaussians, sh=gaussians.sh[:, :1])), dense, degrees)
-    np.testing.assert_array_equal(without_idle(bands.appearance.coefficients, 0, 0.01), [0, 0, 1, 1])
-    np.testing.assert_array_equal(without_idle(empty_bands(degrees, 0), 0, 0.0), degrees)
+    np.testing.assert_array_equal(degrees_after(degrees, dense, 0.0, 1000, idle=0.01), [0, 0, 1, 1])
+    np.testing.assert_array_equal(degrees_after(degrees, np.zeros_like(dense), 0.0, 1000), degrees)
 
 
 @pytest.mark.parametrize("budget_mb", [0.0031])
@@ -226,22 +244,24 @@ def test_an_event_stays_within_its_budget_and_spends_it(budget_mb):
 @pytest.mark.parametrize("base, highest, num_bytes", [(0, 2, 5_000), (1, 3, 900), (0, 3, 100_000)])
 def test_there_is_room_for_all_degrees_that_fit(base, highest, num_bytes):
     """Any degrees within the bytes fit the shape that is planned before, which has few rows to spare."""
-    empty = empty_bands(np.full(NUM, base), base)
+    gaussians = some_gaussians(NUM)
+    low = Model(dataclasses.replace(gaussians, sh=gaussians.sh[:, : (base + 1) ** 2]))
+    empty = with_bands(low, np.zeros((NUM, 16 - (base + 1) ** 2, 3)), np.full(NUM, base)).appearance.coefficients
     room = most_blocks(num_bytes, base, highest, NUM, empty)
     expected = {(0,): bucket_capacity(NUM)}
     for favourite in range(base + 1, highest + 1):  # As many of one degree as fit.
-        cost = 4 * sum(map(floats_of_band, range(base + 1, favourite + 1)))
-        if count := min(NUM, num_bytes // cost):
-            size = tuple(sizes_of_degrees(np.array([favourite]), base)[0].tolist())
-            expected[size] = bucket_capacity(count)
+        size = (favourite + 1) ** 2 - (base + 1) ** 2
+        count = min(NUM, num_bytes // (4 * 3 * size))
+        if count:
+            expected[size,] = bucket_capacity(count)
     assert dict(zip(*room, strict=True)) == expected
     degrees = np.random.default_rng(highest).integers(base, highest + 1, NUM)
-    sizes = sizes_of_degrees(degrees, base)
-    wide = Shape(room.sizes, (bucket_capacity(NUM),) * len(room.sizes))
+    sizes = sizes_of(degrees, base)
+    wide = Layout(room.sizes, (bucket_capacity(NUM),) * len(room.sizes))
     table, _ = resize(empty, sizes, room=wide)
-    assert table.shape == wide
+    assert table.layout == wide
     np.testing.assert_array_equal(table.sizes, sizes)
-    table, _ = resize(table, sizes, room=Shape(room.sizes, (1,) * len(room.sizes)))
+    table, _ = resize(table, sizes, room=Layout(room.sizes, (1,) * len(room.sizes)))
     np.testing.assert_array_equal(table.sizes, sizes)
 
 

@@ -41,7 +41,7 @@ def run_node(*arguments: str, **environment: str) -> None:
 
 
 def trained(scene: a2tg.Scene) -> Source:
-    return Source(a2tg.fit(scene, SYSTEM, progress=False).model, scene.name)
+    return Source(a2tg.fit(scene, SYSTEM).model, scene.name)
 
 
 def ellipsoids(path: Path) -> Path:

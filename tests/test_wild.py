@@ -56,7 +56,7 @@ def trained(scene):
         floaters={"min_views": 2, "at": [1.0]},
         loss={"depth_weight": 1.0, "robust_share": 0.2, "ssim_weight": 0.0},
     )  # fmt: skip
-    return a2tg.fit(found, system, progress=False)
+    return a2tg.fit(found, system)
 
 
 class TestRobust:
@@ -207,7 +207,7 @@ class TestDepthPrior:
     def test_a_training_needs_some_and_may_lack_others(self, scene, trained):
         printed = r"loss.depth_weight, or a custom term, needs depth maps, but no training view has one"
         with pytest.raises(ValueError, match=printed):
-            a2tg.fit(scene, small(loss={"depth_weight": 1.0}), progress=False)
+            a2tg.fit(scene, small(loss={"depth_weight": 1.0}))
         assert np.isfinite(trained.history.loss).all()
 
     def test_maps_come_with_their_photographs(self, scene):

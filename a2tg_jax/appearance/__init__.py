@@ -7,12 +7,9 @@ files.
 from a2tg_jax.appearance.base import (
     Appearance as Appearance,
     allocate_appearance as allocate_appearance,
-    appearance_for as appearance_for,
     count_floats as count_floats,
     gaussian_cutoff as gaussian_cutoff,
-    in_words as in_words,
     project_appearance as project_appearance,
-    template_of as template_of,
 )
 from a2tg_jax.appearance.billboards import Billboards as Billboards
 from a2tg_jax.appearance.elementwise import (

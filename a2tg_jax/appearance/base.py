@@ -254,11 +254,26 @@ class Appearance(NamedFields):
         """[N] shapes of the kernels; None if all are Gaussians."""
         return None if self.exponents is None else self.exponents.shapes
 
+    @property
+    def template(self) -> Self:
+        """The appearance without its arrays: its options."""
+        return without_arrays(self, lambda path: None)
+
+    @property
+    def description(self) -> str:
+        """Class and parts in words, such as "Gaussians with texture and bands" or "plain Gaussians"."""
+        kind = "Gaussians" if type(self) is Appearance else type(self).__name__
+        parts = " and ".join(", ".join(_parts_of(self)).rsplit(", ", 1))
+        if parts:
+            return f"{kind} with {parts}"
+        return "plain Gaussians" if kind == "Gaussians" else kind
+
     def with_textures(self, textures: Textures) -> Self:
         """Return the appearance with other textures. ValueError: it has none, or another number of rows."""
         if self.texture is None:
             raise ValueError(
-                f"no textures to replace in {in_words(self)}: build a model with Appearance(texture=Texture(textures))"
+                f"no textures to replace in {self.description}: build a model with "
+                "Appearance(texture=Texture(textures))"
             )
         check_textures(textures, self._num_rows)
         return dataclasses.replace(self, texture=dataclasses.replace(self.texture, texels=textures))
@@ -281,28 +296,6 @@ class Appearance(NamedFields):
             if table is not None:
                 return table.num
         return None if self.shapes is None else int(self.shapes.shape[0])
-
-
-def appearance_for(
-    options: TextureOptions, *, has_textures: bool, has_degrees: bool = False, has_shapes: bool = False
-) -> Appearance:
-    """Return the template of plain Gaussians with some parts; without textures, only `options.max_alpha` counts."""
-    return Appearance(
-        texture=Texture(None, (1, 1), options) if has_textures else None,
-        exponents=Exponents() if has_shapes else None,
-        bands=Bands() if has_degrees else None,
-        max_alpha=None if has_textures else options.max_alpha,
-    )
-
-
-def in_words(appearance: Appearance) -> str:
-    """Return an appearance in words, such as "Rings with texture and bands"; "plain Gaussians" without anything."""
-    kind = "Gaussians" if type(appearance) is Appearance else type(appearance).__name__
-    parts = [*_parts_of(appearance)]
-    if not parts:
-        return "plain Gaussians" if kind == "Gaussians" else kind
-    *first, last = parts
-    return f"{kind} with {', '.join(first)} and {last}" if first else f"{kind} with {last}"
 
 
 PARTS = ("texture", "exponents", "bands")
@@ -381,11 +374,6 @@ def without_arrays(node: Any, instead: Callable[[str], Any], name: str = "") -> 
         elif value is not None:
             changes[field] = instead(path)
     return dataclasses.replace(node, **changes) if changes else node
-
-
-def template_of(appearance: A) -> A:
-    """Return the appearance without its arrays: its options."""
-    return without_arrays(appearance, lambda path: None)
 
 
 def _parts_of(appearance: Appearance) -> dict[str, Part]:

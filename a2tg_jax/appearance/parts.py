@@ -246,12 +246,8 @@ def texel_coordinates(u: Array, size: Array, options: TextureOptions) -> Array:
 
 OFFSET = 0.02
 """δ, in squared standard deviations."""
-LARGEST_LOG_EXPONENT = 1.0
-"""Largest logarithm of an exponent, and of its inverse."""
-MOST_SHARE = 1 - 1e-7
-"""Largest tanh of a shape that is read, so that the shape is finite."""
-MOST_ROUNDED = 1.5
-"""Largest tanh of a shape in a file: half the coarsest step beyond the range."""
+MOST_TANH = 1 - 1e-7
+"""Largest tanh of a shape that is inverted, so that the shape is finite."""
 LARGEST_RHO = 1e6
 """Squared distance beyond which the falloff is 0 in any case; its powers stay finite up to there."""
 
@@ -262,6 +258,22 @@ class Exponents(Part):
 
     shapes: Array | None = None
     """[N] shapes s of the exponents exp(tanh s); 0 is a Gaussian. None until allocated."""
+
+    @staticmethod
+    def of_logarithms(logarithms: Array) -> "Exponents":
+        """Return the part with exponents of given logarithms, cut to ±1; traceable."""
+        return Exponents(shapes_of(logarithms))
+
+    @property
+    def logarithms(self) -> Array:
+        """[N] logarithms of the exponents, within ±1."""
+        assert self.shapes is not None
+        return jnp.tanh(self.shapes)
+
+    def falloff(self, rho: Array) -> Array:
+        """Return kernels at squared distances, which broadcast with the shapes."""
+        assert self.shapes is not None
+        return falloff_of(curves_of(self.shapes), rho)
 
     def allocate(self, gaussians: Gaussians) -> "Exponents":
         return dataclasses.replace(self, shapes=jnp.zeros(gaussians.num, gaussians.means.dtype))
@@ -280,23 +292,14 @@ class Curve(NamedTuple):
     starts: Array  # [N] δ^β.
 
 
-def log_exponents_of(shapes: np.ndarray) -> np.ndarray:
-    """Return the logarithms of the exponents of shapes, within ±1, as files keep them (host)."""
-    return LARGEST_LOG_EXPONENT * np.tanh(np.asarray(shapes, np.float64))
-
-
-def shapes_of(log_exponents: np.ndarray) -> np.ndarray:
-    """Return the shapes of logarithms of exponents in a file (host). Logarithms that rounding has moved beyond ±1 are
-    cut to ±1; ValueError: one is NaN or farther out than rounding moves it."""
-    shares = np.asarray(log_exponents, np.float64) / LARGEST_LOG_EXPONENT
-    if not (np.abs(shares) <= MOST_ROUNDED).all():
-        raise ValueError(f"the logarithms of the exponents of kernels must be within ±{LARGEST_LOG_EXPONENT:g}")
-    return np.arctanh(np.clip(shares, -MOST_SHARE, MOST_SHARE))
+def shapes_of(logarithms: Array) -> Array:
+    """Return the shapes of exponents of given logarithms, cut to ±1."""
+    return jnp.arctanh(jnp.clip(logarithms, -MOST_TANH, MOST_TANH))
 
 
 def curves_of(shapes: Array) -> Curve:
     """Return the curves of shapes s [N], of exponents β = exp(tanh s) in (1/e, e)."""
-    exponents = jnp.exp(LARGEST_LOG_EXPONENT * jnp.tanh(shapes))
+    exponents = jnp.exp(jnp.tanh(shapes))
     starts = jnp.exp(exponents * np.log(OFFSET))
     return Curve(exponents, 1 / (jnp.exp(exponents * np.log(2 + OFFSET)) - starts), starts)
 
@@ -328,7 +331,7 @@ class Coefficients(Table):
     owners: tuple[Array, ...] = ()
     """[capacity] int32 Gaussian of each row of each bucket; N for a row of padding."""
 
-    num_sides: ClassVar[int] = 1
+    num_axes: ClassVar[int] = 1
     padding: ClassVar[tuple[float, ...]] = (0.0, 0.0, 0.0)
 
     @classmethod
@@ -462,7 +465,7 @@ MOST_LOG_SCALE = 0.9
 def nearest_gaussians(gaussians: Gaussians, shapes: np.ndarray) -> Gaussians:
     """Return the Gaussians nearest to kernels of the given shapes [N]: other scales and opacities (host)."""
     tabulated, peaks, log_scales = _table()
-    log_exponents = log_exponents_of(shapes)
+    log_exponents = np.tanh(np.asarray(shapes, np.float64))
     opacities = np.asarray(gaussians.opacities, np.float64) * np.interp(log_exponents, tabulated, peaks)
     dtype = gaussians.means.dtype
     limited = jnp.asarray(np.clip(opacities, LEAST_OPACITY, LARGEST_OPACITY), dtype)
@@ -473,9 +476,10 @@ def nearest_gaussians(gaussians: Gaussians, shapes: np.ndarray) -> Gaussians:
 @functools.cache
 def _table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return logarithms of exponents in order, and of the nearest Gaussian of each a and the logarithm of √k."""
-    log_exponents = np.linspace(-LARGEST_LOG_EXPONENT, LARGEST_LOG_EXPONENT, NUM_SHAPES)
+    log_exponents = np.linspace(-1.0, 1.0, NUM_SHAPES)
     radii = np.linspace(0, LARGEST_PLACE, NUM_PLACES)
-    curves = curves_of(jnp.asarray(shapes_of(log_exponents))[:, None])
+    shapes = np.arctanh(np.clip(log_exponents, -MOST_TANH, MOST_TANH))
+    curves = curves_of(jnp.asarray(shapes)[:, None])
     kernels = np.asarray(falloff_of(curves, jnp.asarray(radii**2)[None]), np.float64)
     log_scales = np.linspace(LEAST_LOG_SCALE, MOST_LOG_SCALE, NUM_SCALES)
     squares = np.exp(2 * log_scales)

@@ -88,9 +88,9 @@ def read_object(file: Path) -> dict[str, Any]:
     return values
 
 
-def number_of(value: object, what: str) -> float:
-    """Return a number in a file, which some programs write as a text, such as "105.6". Raises ValueError, naming it
-    `what`, for any other value."""
+def lenient_number(value: object, name: str) -> float:
+    """Return a number in a file, which some programs write as a text, such as "105.6". Raises ValueError, with its
+    name, for any other value."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         return float(value)
     if isinstance(value, str):
@@ -98,7 +98,7 @@ def number_of(value: object, what: str) -> float:
             number = float(value)
             if math.isfinite(number):
                 return number
-    raise ValueError(f"{what} must be a number; got {shortened(repr(value))}")
+    raise ValueError(f"{name} must be a number; got {shortened(repr(value))}")
 
 
 def parse_toml(data: bytes) -> dict[str, Any]:
@@ -138,7 +138,7 @@ def _parsed(parse: Callable[[], Any]) -> Any:
     raise ValueError(f"its brackets are nested more than {DEEPEST} deep")
 
 
-def numbers_of(values: object, count: int | None, name: str, *, null: float | None = None) -> np.ndarray:
+def number_array(values: object, count: int | None, name: str, *, null: float | None = None) -> np.ndarray:
     """Return a list of numbers in JSON as float64 [n].
 
     Args:

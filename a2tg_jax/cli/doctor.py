@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax import Camera, Gaussians, RenderSettings, Textures, allocate_textures, init_from_points, render_image
-from a2tg_jax.base.machine import VARIABLE, memory_limit, num_threads
+from a2tg_jax.base.memory import memory_limit
 from a2tg_jax.base.operating_system import cuda_of_driver
+from a2tg_jax.base.threads import VARIABLE, num_threads
 from a2tg_jax.core.numerics import MOST_DIFFERENCE, relative_difference
 from a2tg_jax.host.startup import compilation_cache_folder
 from a2tg_jax.rasterize.kernels import platforms

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from typing import Any
 
-from a2tg_jax.base.machine import check_ulimits
+from a2tg_jax.base.memory import check_ulimits
 from a2tg_jax.base.regular_files import expanded
 from a2tg_jax.base.text import did_you_mean, shortened
 from a2tg_jax.host import signals

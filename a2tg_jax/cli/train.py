@@ -91,7 +91,7 @@ class Train:
         import jax
 
         from a2tg_jax import Session
-        from a2tg_jax.base.machine import tidy_memory
+        from a2tg_jax.base.memory import tidy_memory
         from a2tg_jax.cli import training
         from a2tg_jax.results.forecast import room_for_photographs
         from a2tg_jax.results.history import tensorboard_library

@@ -8,7 +8,7 @@ from pathlib import Path
 import jax
 
 from a2tg_jax import A2tg, Gaussians2dMcmc, Mcmc, Scene, Session, Upscale
-from a2tg_jax.base.machine import tidy_memory
+from a2tg_jax.base.memory import tidy_memory
 from a2tg_jax.base.text import counted
 from a2tg_jax.cli.arguments import open_browser, print_now
 from a2tg_jax.data.load import SceneSource

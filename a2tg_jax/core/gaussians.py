@@ -105,6 +105,12 @@ class Gaussians(NamedFields):
         return jnp.exp(jnp.mean(self.log_scales, axis=1))
 
     @property
+    def rotations(self) -> Array:
+        """[N, 3, 3] rotation matrices, whose columns are the Gaussians' axes in the world, the normal last."""
+        columns = rotation_columns(tuple(jnp.moveaxis(self.quats, -1, 0)))
+        return jnp.stack([jnp.stack(column, -1) for column in columns], -1)
+
+    @property
     def opacities(self) -> Array:
         """[N] peak opacities in (0, 1)."""
         return jax.nn.sigmoid(self.logit_opacities)
@@ -160,12 +166,6 @@ def rotation_columns(quat: tuple[Array, ...]) -> tuple[tuple[Array, ...], ...]:
         (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
         (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
     )
-
-
-def rotation_matrices(quats: Array) -> Array:
-    """Return the rotation matrices [..., 3, 3] of quaternions [..., 4] (wxyz), which are normalised first."""
-    columns = rotation_columns(tuple(jnp.moveaxis(quats, -1, 0)))
-    return jnp.stack([jnp.stack(column, -1) for column in columns], -1)
 
 
 def logit(p: Array) -> Array:

@@ -21,7 +21,6 @@ with warnings.catch_warnings():
     # jaxopt warns at import that it is no longer maintained, about which users of this package can do nothing.
     warnings.filterwarnings("ignore", message="JAXopt is no longer maintained", category=DeprecationWarning)
     from jaxopt import OptStep as OptStep  # type: ignore[import-untyped]
-    from jaxopt.linear_solve import solve_cg as solve_cg  # type: ignore[import-untyped]
 
 
 @pytree

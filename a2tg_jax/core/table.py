@@ -2,13 +2,14 @@
 
 N Gaussians. A block of size (T₁, …) is [T₁, …, C], such as a texture (Tv, Tu) of C = 4 channels, or the spherical
 harmonics (K,) of C = 3 colours that a Gaussian has beyond the common ones. Blocks of one size share a bucket
-[capacity, T₁, …, C], whose rows past the used ones are padding. Programs are compiled for sizes and capacities, so that
-only a change of these, on the host, compiles a step again.
+[capacity, T₁, …, C], whose rows past the used ones are padding. The place of a block is its bucket and its row in it.
+Sizes and capacities are the layout of the buckets. Programs are compiled for it, so that only a change of the layout,
+on the host, compiles a step again.
 """
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple, Self, TypeVar
 
 import jax
@@ -26,21 +27,48 @@ Size = tuple[int, ...]
 Group = tuple[np.ndarray, np.ndarray]
 """Indices [n] of Gaussians, and their blocks [n, T₁, …, C], all of one size."""
 KNOWN_SLACK = 1.25
-"""A known shape is reused if it has at most this many times the elements of the smallest shape."""
+"""A known layout is reused if it has at most this many times the elements of the smallest one."""
 
 
-class Shape(NamedTuple):
-    """Sizes and capacities of all buckets; programs are compiled for a shape."""
+def bucket_capacity(count: int) -> int:
+    """Return the rows allotted to `count` blocks, rounded up to 1/16 of its power of two so that few layouts occur."""
+    if count == 0:
+        return 0
+    # At most an eighth is spare: counts of b bits are at least 2^(b−1), and rounded up to 2^(b−4).
+    granule: int = max(1, 2 ** (count.bit_length() - 4))
+    return -(-count // granule) * granule
+
+
+class Layout(NamedTuple):
+    """Sizes and capacities of all buckets."""
 
     sizes: tuple[Size, ...]
     """Size of the blocks of each bucket, ascending."""
     capacities: tuple[int, ...]
     """Number of rows of each bucket."""
 
+    @staticmethod
+    def of(counts: Mapping[Size, int]) -> "Layout":
+        """Return the smallest layout for numbers of blocks by size, ascending."""
+        return Layout(tuple(counts), tuple(map(bucket_capacity, counts.values())))
+
     @property
     def num_elements(self) -> int:
         """Number of texels, or of coefficients, padding included."""
-        return sum(capacity * int(np.prod(size)) for capacity, size in zip(self.capacities, self.sizes, strict=True))
+        return sum(math.prod(size) * capacity for size, capacity in zip(*self, strict=True))
+
+    def has_room(self, counts: Mapping[Size, int]) -> bool:
+        """Return whether numbers of blocks by size fit."""
+        rows = dict(zip(*self, strict=True))
+        return all(rows.get(size, 0) >= count for size, count in counts.items())
+
+
+class Places(NamedTuple):
+    """Place of each block."""
+
+    bucket: Array
+    row: Array
+    layout: Layout
 
 
 @pytree
@@ -59,8 +87,8 @@ class Table(NamedFields):
     bucket_sizes: tuple[Size, ...] = static()
     """Size of the blocks of each bucket, ascending."""
 
-    num_sides: ClassVar[int]
-    """Number D of sides of a block."""
+    num_axes: ClassVar[int]
+    """Number D of axes of a block, channels excluded."""
     padding: ClassVar[tuple[float, ...]]
     """C numbers of padding, and of what grows from an empty block."""
 
@@ -80,35 +108,27 @@ class Table(NamedFields):
 
     @classmethod
     def allocate(cls, sizes: ArrayLike, values: Sequence[float], dtype: DTypeLike = jnp.float32) -> Self:
-        """Return blocks of the given sizes [N, D] that hold the C `values` everywhere (host); one with sides of 0
-        takes no bytes."""
-        places, capacities = plan_places(np.asarray(sizes))
-        shapes = zip(capacities, places.bucket_sizes, strict=True)
-        return cls.placed([cls._padded(capacity, size, dtype, values) for capacity, size in shapes], places)
+        """Return blocks of the given sizes [N, D] that hold the C `values` everywhere (host); one of size 0 takes no
+        bytes."""
+        places = plan_places(np.asarray(sizes))
+        return cls.placed(_filled(places.layout, values, dtype), places)
 
     @classmethod
-    def placed(cls, buckets: Sequence[Any], places: "Places") -> Self:
+    def placed(cls, buckets: Sequence[np.ndarray], places: Places) -> Self:
         """Return the table of buckets and of the places that were planned for them (host)."""
         # It compiles nothing, unlike `jnp.asarray`.
-        return cls(tuple(map(jax.device_put, buckets)), *places)
-
-    @classmethod
-    def _padded(cls, capacity: int, size: Size, dtype: DTypeLike, padding: Sequence[float] | None = None) -> np.ndarray:
-        values = np.asarray(cls.padding if padding is None else padding, dtype)
-        # A copy, because views of broadcasting are read-only.
-        return np.broadcast_to(values, (capacity, *size, len(values))).copy()
+        return cls(tuple(map(jax.device_put, buckets)), places.bucket, places.row, places.layout.sizes)
 
     @classmethod
     def of_groups(cls, groups: Iterable[Group]) -> Self:
         """Return the table of groups that together have each of N Gaussians once; the inverse of `groups` (host)."""
         groups = [group for group in groups if len(group[0])]
-        sizes = np.zeros((sum(len(ids) for ids, _ in groups), cls.num_sides), np.int64)
+        sizes = np.zeros((sum(len(ids) for ids, _ in groups), cls.num_axes), np.int64)
         for ids, blocks in groups:
             sizes[ids] = blocks.shape[1:-1]
-        places, capacities = plan_places(sizes)
+        places = plan_places(sizes)
         dtype = np.result_type(*(blocks for _, blocks in groups)) if groups else np.float32
-        shapes = zip(capacities, places.bucket_sizes, strict=True)
-        buckets = [cls._padded(capacity, size, dtype) for capacity, size in shapes]
+        buckets = _filled(places.layout, cls.padding, dtype)
         rows = np.asarray(places.row)
         for ids, blocks in groups:
             buckets[int(places.bucket[ids[0]])][rows[ids]] = blocks
@@ -133,25 +153,22 @@ class Table(NamedFields):
     @classmethod
     def of_flat(cls, sizes: np.ndarray, elements: np.ndarray) -> Self:
         """Return the table of sizes [N, D] and of what `flat` returned, which fits them (host)."""
-        places, _ = plan_places(sizes)
-        ends = np.cumsum(sizes.prod(axis=1))
-        groups = []
-        for index, size in enumerate(places.bucket_sizes):
-            ids = np.flatnonzero(np.asarray(places.bucket) == index)
-            # A block ends where the running sum of areas does.
-            rows = ends[ids, None] + np.arange(-math.prod(size), 0)
-            groups.append((ids, elements[rows].reshape(len(ids), *size, elements.shape[1])))
-        return cls.of_groups(groups)
+        empty = cls.allocate(sizes, cls.padding, elements.dtype)
+        return cls.of_groups((ids, elements[rows].reshape(blocks.shape)) for ids, blocks, rows in empty._flat_groups())
 
     def flat(self) -> np.ndarray:
         """Return the elements [M, C] of all blocks, block after block, each row by row (host)."""
-        ends = np.cumsum(self.sizes.prod(axis=1))
-        dtype = self.buckets[0].dtype if self.buckets else np.float32
-        elements = np.zeros((ends[-1] if self.num else 0, len(self.padding)), dtype)
-        for ids, blocks in self.groups():
-            area = math.prod(blocks.shape[1:-1])
-            elements[ends[ids, None] + np.arange(-area, 0)] = blocks.reshape(len(ids), area, len(self.padding))
+        elements = np.zeros((self.count_elements(self.num), len(self.padding)), self._dtype)
+        for _, blocks, rows in self._flat_groups():
+            elements[rows] = blocks.reshape(*rows.shape, len(self.padding))
         return elements
+
+    def _flat_groups(self) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Yield each group, and the rows [n, T₁·…] of its elements in `flat`."""
+        ends = np.cumsum(self.sizes.prod(axis=1))
+        for ids, blocks in self.groups():
+            # A block ends where the running sum of its elements and those before does.
+            yield ids, blocks, ends[ids, None] + np.arange(-math.prod(blocks.shape[1:-1]), 0)
 
     @classmethod
     def joined(cls, tables: Sequence[Self]) -> Self:
@@ -170,14 +187,18 @@ class Table(NamedFields):
 
     @property
     def sizes(self) -> np.ndarray:
-        """[N, D] integers, the sides of each block (host)."""
-        sides = np.asarray(self.bucket_sizes, np.int64).reshape(-1, self.num_sides)
-        return sides[np.asarray(self.bucket)]
+        """[N, D] integers, the size of each block (host)."""
+        sizes = np.asarray(self.bucket_sizes, np.int64).reshape(-1, self.num_axes)
+        return sizes[np.asarray(self.bucket)]
 
     @property
-    def shape(self) -> Shape:
+    def layout(self) -> Layout:
         """Sizes and capacities of the buckets."""
-        return Shape(self.bucket_sizes, tuple(map(len, self.buckets)))
+        return Layout(self.bucket_sizes, tuple(map(len, self.buckets)))
+
+    @property
+    def _dtype(self) -> DTypeLike:
+        return self.buckets[0].dtype if self.buckets else np.float32
 
     def count_elements(self, num: int) -> int:
         """Return the number of texels or coefficients of the first `num` Gaussians, without padding (host).
@@ -219,12 +240,9 @@ class Table(NamedFields):
     def take(self, rows: np.ndarray, padding: Sequence[float] | None = None) -> Self:
         """Return the blocks of the Gaussians `rows` [M], which may repeat, in buckets as small as they need (host).
         Padding is `padding` of the class, or C given numbers, such as zeros for moments."""
-        places, capacities = plan_places(self.sizes[rows])
         bucket, row = _indices(self)
-        old_and_new = ((bucket[rows], row[rows]), _indices(places))
-        padding = padding or self.padding
-        buckets = _moved(type(self), self.buckets, old_and_new, places.bucket_sizes, capacities, padding)
-        return self.placed(buckets, places)
+        ids = np.arange(len(rows))
+        return _rebuilt(self, (bucket[rows], row[rows]), ids, plan_places(self.sizes[rows]), padding or self.padding)
 
     def nearest_places(self) -> Self:
         """Return the table with int32 buckets and rows, each moved to the nearest one that exists; traced.
@@ -289,99 +307,73 @@ def is_held(x: object) -> bool:
 
 # Places
 
+TableT = TypeVar("TableT", bound=Table)
 _Indices = tuple[np.ndarray, np.ndarray]
 """Buckets and rows of blocks."""
 
 
-class Places(NamedTuple):
-    """Place of each block, as the fields of `Table`."""
-
-    bucket: Array
-    row: Array
-    bucket_sizes: tuple[Size, ...]
+def _indices(table: Table) -> _Indices:
+    return np.asarray(table.bucket), np.asarray(table.row)
 
 
-def _indices(places: Table | Places) -> _Indices:
-    return np.asarray(places.bucket), np.asarray(places.row)
-
-
-def bucket_capacity(count: int) -> int:
-    """Return the rows allotted to `count` blocks, rounded up to 1/16 of its power of two so that few shapes occur."""
-    if count == 0:
-        return 0
-    # At most an eighth is spare: counts of b bits are at least 2^(b−1), and rounded up to 2^(b−4).
-    granule: int = max(1, 2 ** (count.bit_length() - 4))
-    return -(-count // granule) * granule
-
-
-def plan_places(
-    sizes: np.ndarray, known: Sequence[Shape] = (), room: Shape | None = None
-) -> tuple[Places, tuple[int, ...]]:
-    """Return the places of blocks of the given sizes [N, D], from 0 to 63, and the capacity of each bucket (host).
-
-    If `room`, of any size, has space for the blocks, it is used; otherwise the smallest known shape that has, with at
-    most `KNOWN_SLACK` times the elements needed, because its programs are compiled; otherwise the smallest shape.
-    """
-    for shape in known:
-        check_kind("known", shape, Shape)
-    if room is not None:
-        check_kind("room", room, Shape)
+def plan_places(sizes: np.ndarray, known: Sequence[Layout] = (), room: Layout | None = None) -> Places:
+    """Return the places of blocks of the given sizes [N, D], from 0 to 63, in a layout of `choose_layout` (host)."""
     # Codes of sizes ascend as the sizes do.
     weights = 64 ** np.arange(sizes.shape[1])[::-1]
-    codes, bucket, counts = np.unique(sizes @ weights, return_inverse=True, return_counts=True)
+    codes, group, counts = np.unique(sizes @ weights, return_inverse=True, return_counts=True)
+    distinct = map(tuple, (codes[:, None] // weights % 64).tolist())
+    needed: dict[Size, int] = dict(zip(distinct, counts.tolist(), strict=True))
+    # Without Gaussians, one bucket of no blocks keeps the number of axes and the dtype.
+    layout = choose_layout(needed, known, room) if needed else Layout(((0,) * sizes.shape[1],), (0,))
+    bucket = np.asarray([layout.sizes.index(size) for size in needed], np.int32)
     # Stable: rows of a bucket are in the order of the Gaussians, so that equal sizes lead to equal places.
-    order = np.argsort(bucket, kind="stable")
-    starts = np.repeat(np.cumsum(counts) - counts, counts)
+    order = np.argsort(group, kind="stable")
     row = np.empty(len(sizes), np.int32)
-    row[order] = np.arange(len(sizes)) - starts
-    sides = map(tuple, (codes[:, None] // weights % 64).tolist())
-    needed: dict[Size, int] = dict(zip(sides, counts.tolist(), strict=True))
-    smallest = Shape(tuple(needed), tuple(map(bucket_capacity, needed.values())))
+    row[order] = np.arange(len(sizes)) - np.repeat(np.cumsum(counts) - counts, counts)
+    return Places(jax.device_put(bucket[group]), jax.device_put(row), layout)
 
-    def has_room(shape: Shape) -> bool:
-        rows = dict(zip(*shape, strict=True))
-        return all(rows.get(size, 0) >= count for size, count in needed.items())
 
-    if not needed:
-        # Without Gaussians, one bucket of no blocks keeps the number of sides and the dtype.
-        shape = Shape(((0,) * sizes.shape[1],), (0,))
-    elif room is not None and has_room(room):
-        shape = room
-    else:
-        most = KNOWN_SLACK * smallest.num_elements
-        fitting = [shape for shape in known if has_room(shape) and shape.num_elements <= most]
-        shape = min(fitting, key=lambda shape: shape.num_elements, default=smallest)
-    place = np.asarray([shape.sizes.index(size) for size in needed], np.int32)
-    return Places(jax.device_put(place[bucket]), jax.device_put(row), shape.sizes), shape.capacities
+def choose_layout(needed: Mapping[Size, int], known: Sequence[Layout] = (), room: Layout | None = None) -> Layout:
+    """Return a layout for numbers of blocks by size, ascending.
+
+    It is `room`, however large, if that has space; otherwise the smallest known one that has, with at most
+    `KNOWN_SLACK` times the elements needed, because its programs are compiled; otherwise the smallest possible one.
+    """
+    for layout in known:
+        check_kind("known", layout, Layout)
+    if room is not None:
+        check_kind("room", room, Layout)
+        if room.has_room(needed):
+            return room
+    smallest = Layout.of(needed)
+    most = KNOWN_SLACK * smallest.num_elements
+    fitting = [layout for layout in known if layout.has_room(needed) and layout.num_elements <= most]
+    return min(fitting, key=lambda layout: layout.num_elements, default=smallest)
 
 
 def resize(
     table: Table,
     sizes: np.ndarray,
     moments: object = None,
-    known: Sequence[Shape] = (),
+    known: Sequence[Layout] = (),
     kept: np.ndarray | None = None,
-    room: Shape | None = None,
+    room: Layout | None = None,
 ) -> tuple[Any, Any]:
     """Return the table with its buckets rebuilt at new sizes [N, D] (host), and the moments likewise.
 
     Padding, and what grows from an empty block, is `Table.padding` in the table and 0 in moments.
 
     Moments are any pytree, such as the state of Adam: all tables in it of the same class are rebuilt, other leaves
-    stay. They become 0 for blocks that are not `kept` [N]. `known` and `room` are as for `plan_places`.
+    stay. They become 0 for blocks that are not `kept` [N]. `known` and `room` are as for `choose_layout`.
     """
-    places, capacities = plan_places(sizes, known, room)
-    old_and_new = [_indices(table), _indices(places)]
-    kept_old_and_new = old_and_new
+    places = plan_places(sizes, known, room)
+    bucket, row = _indices(table)
+    ids = np.arange(table.num)
+    kept_ids = ids
     if kept is not None:
         check_mask("kept", kept, (table.num,))
-        kept_old_and_new = [(bucket[kept], row[kept]) for bucket, row in old_and_new]
+        kept_ids = np.flatnonzero(kept)
     kind = type(table)
-
-    def rebuilt(old: Table, old_and_new: list[_Indices], padding: Sequence[float]) -> Table:
-        targets = _moved(kind, old.buckets, old_and_new, places.bucket_sizes, capacities, padding)
-        whole = kind.placed(targets, places)
-        return partition(whole)[0] if old.bucket is None else whole  # Moments are floats only.
 
     def rebuilt_moments(leaf: object) -> Any:
         if not isinstance(leaf, kind):
@@ -390,30 +382,36 @@ def resize(
             raise ValueError(f"moments must have the buckets of the table; got {leaf}")
         for index, (moment, blocks) in enumerate(zip(leaf.buckets, table.buckets, strict=True)):
             check_shape(f"moments.buckets[{index}]", moment, blocks.shape)
-        return rebuilt(leaf, kept_old_and_new, (0.0,) * len(kind.padding))
+        rebuilt = _rebuilt(leaf, (bucket[kept_ids], row[kept_ids]), kept_ids, places, (0.0,) * len(kind.padding))
+        return partition(rebuilt)[0] if leaf.bucket is None else rebuilt  # Moments are floats only.
 
     moments = jax.tree.map(rebuilt_moments, moments, is_leaf=lambda leaf: isinstance(leaf, kind))
-    return rebuilt(table, old_and_new, kind.padding), moments
+    return _rebuilt(table, (bucket, row), ids, places, kind.padding), moments
 
 
-def _moved(
-    kind: type[Table], buckets: Sequence[Any], old_and_new: Sequence[_Indices], sizes: Sequence[Size],
-    capacities: Sequence[int], padding: Sequence[float],
-) -> list[np.ndarray]:  # fmt: skip
-    """Return new buckets of given sizes and capacities, with blocks moved from old to new (bucket, row)."""
-    dtype = buckets[0].dtype if buckets else np.float32
-    targets = [kind._padded(capacity, size, dtype, padding) for capacity, size in zip(capacities, sizes, strict=True)]
-    (old_bucket, old_row), (new_bucket, new_row) = old_and_new
-    for index, bucket in enumerate(buckets):
+def _rebuilt(old: TableT, sources: _Indices, ids: np.ndarray, places: Places, padding: Sequence[float]) -> TableT:
+    """Return a table with the blocks of the old one that are at (bucket, row) [n], resized, as those of the Gaussians
+    `ids` [n]; other Gaussians have padding."""
+    buckets = _filled(places.layout, padding, old._dtype)
+    old_bucket, old_row = sources
+    new_bucket = np.asarray(places.bucket)[ids]
+    new_row = np.asarray(places.row)[ids]
+    for index, bucket in enumerate(old.buckets):
         from_here = np.flatnonzero(old_bucket == index)
-        # Blocks with a side of 0 have nothing to move.
+        # Blocks with an axis of 0 have nothing to move.
         if not bucket.size or not len(from_here):
             continue
         source = np.asarray(bucket)  # Each old bucket is read once, one after the other.
         for target in np.unique(new_bucket[from_here]).tolist():
-            ids = from_here[new_bucket[from_here] == target]
-            targets[target][new_row[ids]] = kind.resized(source[old_row[ids]], sizes[target])
-    return targets
+            moved = from_here[new_bucket[from_here] == target]
+            buckets[target][new_row[moved]] = old.resized(source[old_row[moved]], places.layout.sizes[target])
+    return old.placed(buckets, places)
+
+
+def _filled(layout: Layout, values: Sequence[float], dtype: DTypeLike) -> list[np.ndarray]:
+    """Return buckets whose blocks hold C values everywhere."""
+    buckets = zip(*layout, strict=True)
+    return [np.full((capacity, *size, len(values)), values, dtype) for size, capacity in buckets]
 
 
 # Checks

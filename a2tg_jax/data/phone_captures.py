@@ -13,7 +13,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation, label
 from scipy.spatial.transform import Rotation
 
-from a2tg_jax.base.json_text import MOST_BYTES, number_of, read_object
+from a2tg_jax.base.json_text import MOST_BYTES, lenient_number, read_object
 from a2tg_jax.base.regular_files import is_regular, read_regular
 from a2tg_jax.base.text import shortened
 from a2tg_jax.data.assembly import PointCloud
@@ -86,11 +86,11 @@ def _polycam_frame(file: Path, image: Path) -> dict[str, Any]:
     def number(name: str) -> float:
         if values.get(name) is None:
             raise ValueError(f"{file}: lacks {name}, a number of the camera; export the raw data again")
-        return number_of(values[name], f"{file}: {name}")
+        return lenient_number(values[name], f"{file}: {name}")
 
     frame: dict[str, Any] = {key: number(name) for key, name in INTRINSICS.items()}
     frame["transform_matrix"] = [[number(f"t_{row}{column}") for column in range(4)] for row in range(3)]
-    size = [number_of(values.get(side) or 0, f"{file}: {side}") for side in ("width", "height")]
+    size = [lenient_number(values.get(side) or 0, f"{file}: {side}") for side in ("width", "height")]
     # Newer exports have none.
     frame["w"], frame["h"] = size if min(size) > 0 else picture_size(image)
     frame["file_path"] = f"{image.parent.name}/{image.name}"

@@ -10,7 +10,8 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from a2tg_jax import Picture
-from a2tg_jax.base.machine import cache_folder, memory_limit
+from a2tg_jax.base.machine import cache_folder
+from a2tg_jax.base.memory import memory_limit
 from a2tg_jax.core.pictures import checksum_of
 from a2tg_jax.data.decoding import read_pixels
 

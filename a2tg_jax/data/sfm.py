@@ -15,9 +15,9 @@ import numpy as np
 from PIL import Image
 
 from a2tg_jax.base.checks import check_literal
-from a2tg_jax.base.machine import num_threads
 from a2tg_jax.base.regular_files import expanded
 from a2tg_jax.base.text import counted, first_names
+from a2tg_jax.base.threads import num_threads
 from a2tg_jax.core.origin import vertical_of
 from a2tg_jax.data.capture_geometry import upright_rotation
 from a2tg_jax.data.colmap_cameras import ColmapCamera

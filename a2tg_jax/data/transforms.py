@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from a2tg_jax import Scene
-from a2tg_jax.base.json_text import number_of, read_json
+from a2tg_jax.base.json_text import lenient_number, read_json
 from a2tg_jax.base.regular_files import is_regular, names_in
 from a2tg_jax.base.text import first_names, shortened
 from a2tg_jax.core.cameras import LONGEST_SIDE
@@ -224,7 +224,7 @@ def _photo(file: Path, frame: dict[str, Any], use: LensUse, counted: Counted | N
     what = f"{file}: {name}"
     # Without a size in the frame, the lens needs the full image's, once that is found.
     lens: Lens | Callable[[tuple[int, int]], Lens] = functools.partial(_lens, frame, what, use)
-    if all(frame.get(side) and number_of(frame[side], f"{what}: {side}") for side in "wh"):
+    if all(frame.get(side) and lenient_number(frame[side], f"{what}: {side}") for side in "wh"):
         lens = _lens(frame, what, use, (0, 0))
     path = file.parent / name
     images = file.parent / "images"
@@ -259,7 +259,7 @@ def _lens(frame: dict[str, Any], what: str, use: LensUse, full: tuple[int, int])
     """Return the camera of a frame; its size defaults to the full image's, the principal point to the centre."""
 
     def number(key: str, default: float) -> float:
-        return number_of(frame.get(key, default), f"{what}: {key}")
+        return lenient_number(frame.get(key, default), f"{what}: {key}")
 
     def side(key: str, default: int) -> int:
         given = number(key, default) if frame.get(key) else 0

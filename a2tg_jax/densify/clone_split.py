@@ -14,7 +14,7 @@ from jax import Array
 
 from a2tg_jax.base.checks import check_number
 from a2tg_jax.core.budget import number_to_reach
-from a2tg_jax.core.gaussians import Gaussians, rotation_matrices
+from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import partition, pytree, static
 from a2tg_jax.events import (
@@ -193,7 +193,7 @@ def apply_plan(key: Array, plan: CloneSplitPlan, model: Model, moments: AdamStat
 def split_in_half(key: Array, gaussians: Gaussians, is_half: Array) -> Gaussians:
     """Return marked rows [N] at a point drawn from their Gaussian, 1.6 times smaller."""
     drawn = jax.random.normal(key, gaussians.scales.shape, gaussians.means.dtype) * gaussians.scales
-    axes = rotation_matrices(gaussians.quats)[:, :, :2]
+    axes = gaussians.rotations[:, :, :2]
     means = gaussians.means + jnp.sum(axes * drawn[:, None, :], axis=2)
     return dataclasses.replace(
         gaussians,

@@ -15,7 +15,7 @@ from jax import Array
 from jax.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from a2tg_jax.appearance import allocate_appearance, template_of
+from a2tg_jax.appearance import allocate_appearance
 from a2tg_jax.base.checks import check_number
 from a2tg_jax.core.cameras import back_project
 from a2tg_jax.core.gaussians import Gaussians, no_rows, sh_of_colors
@@ -85,7 +85,7 @@ class PlaceByError(HostEvent):
             reason = "share adds no Gaussian, because views are right wherever a surface is drawn and masks count"
             return Change(model, moments, state, unused=reason)
         key = jax.random.fold_in(jax.random.key(due.seed), due.index)
-        appearance = allocate_appearance(template_of(model.appearance), key, added)
+        appearance = allocate_appearance(model.appearance.template, key, added)
         rows = np.arange(num, num + added.num)
 
         def replaced(old: Array, new: ArrayLike) -> Array:

@@ -13,7 +13,6 @@ import numpy as np
 from jax import Array
 from jax.typing import DTypeLike
 
-from a2tg_jax.appearance import in_words
 from a2tg_jax.appearance.parts import MAX_DEGREE, Coefficients, degrees_of_sizes, floats_of_band, sizes_of_degrees
 from a2tg_jax.base.checks import check_number
 from a2tg_jax.base.text import bytes_of
@@ -21,7 +20,7 @@ from a2tg_jax.core.budget import BYTES_PER_FLOAT, MOST_ROOM, event_budget, withi
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.sh import NUM_BASES, directions_from, sh_basis
-from a2tg_jax.core.table import Shape, bucket_capacity, resize
+from a2tg_jax.core.table import Layout, Size, resize
 from a2tg_jax.events import Change, Due, HostEvent, Seen, Times, times_at
 from a2tg_jax.model import Model
 
@@ -121,7 +120,7 @@ class AdaptDegrees(HostEvent):
         num = model.num
         if table is None:
             raise ValueError(
-                f"{in_words(model.appearance)} cannot raise degrees: the stage needs Appearance(bands=Bands())"
+                f"{model.appearance.description} cannot raise degrees: the stage needs Appearance(bands=Bands())"
             )
         degrees = without_idle(table, base, self.idle)
         floats = 3 * np.asarray(NUM_BASES)
@@ -130,22 +129,22 @@ class AdaptDegrees(HostEvent):
         used = model.num_bytes - saved
         budget = event_budget(bytes_of(self.budget_mb), used, due.index, due.count)
         degrees[:num] = raised_degrees(degrees[:num], state.strengths()[:num], budget, self.highest)
-        table, moments = resize(table, sizes_of_degrees(degrees, base), moments, room=table.shape)
+        table, moments = resize(table, sizes_of_degrees(degrees, base), moments, room=table.layout)
         model = dataclasses.replace(model, appearance=model.appearance.with_coefficients(table))
         return Change(model, moments, self.init(model))
 
 
-def most_blocks(num_bytes: float, base_degree: int, highest: int, num: int, table: Coefficients) -> Shape:
-    """Return a shape with room for all blocks, of degrees up to the highest, that `num` Gaussians can have within some
+def most_blocks(num_bytes: float, base_degree: int, highest: int, num: int, table: Coefficients) -> Layout:
+    """Return a layout with room for all blocks, of degrees up to the highest, that `num` Gaussians can have within some
     bytes (host)."""
     # All Gaussians may have none.
-    counts = {(0,): bucket_capacity(table.num)}
+    counts: dict[Size, int] = {(0,): table.num}
     for degree in range(base_degree + 1, highest + 1):
         size = NUM_BASES[degree] - NUM_BASES[base_degree]
         count = min(num, max(0, int(num_bytes // (BYTES_PER_FLOAT * 3 * size))))
         if count:
-            counts[size,] = bucket_capacity(count)
-    return Shape(tuple(counts), tuple(counts.values()))
+            counts[size,] = count
+    return Layout.of(counts)
 
 
 def without_idle(table: Coefficients, base_degree: int, idle: float) -> np.ndarray:

@@ -20,6 +20,7 @@ import numpy as np
 
 from a2tg_jax import (
     Camera,
+    Exponents,
     Gaussians,
     Gaussians2d,
     Model,
@@ -27,13 +28,16 @@ from a2tg_jax import (
     Renderer,
     Scene,
     Similarity,
+    Texture,
     TextureOptions,
+    TextureRegion,
+    Textures,
     View,
     fit_stage,
 )
-from a2tg_jax.appearance.parts import MAX_DEGREE, curves_of, falloff_of, nearest_gaussians, texel_coordinates
-from a2tg_jax.core.budget import BYTES_PER_FLOAT
-from a2tg_jax.core.gaussians import floats_per_gaussian, logit, rotation_matrices
+from a2tg_jax.appearance.parts import MAX_DEGREE, nearest_gaussians
+from a2tg_jax.core.budget import bytes_per_gaussian
+from a2tg_jax.core.gaussians import logit
 from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.origin import Color
 from a2tg_jax.core.sh import NUM_BASES, SH_C0
@@ -42,7 +46,6 @@ from a2tg_jax.data.capture_geometry import camera_centers, matrices_of, without_
 from a2tg_jax.finish.shrinking import fewest_texels, texel_weights
 from a2tg_jax.host.training_bar import ProgressBar
 from a2tg_jax.model import plain_gaussians
-from a2tg_jax.texture import NEUTRAL_TEXEL
 
 MOST_VIEWS = 12
 """Largest number of views, evenly chosen, for measuring where texels and spherical harmonics matter."""
@@ -91,7 +94,7 @@ def split_splats(model: Model, cameras: Sequence[Camera], growth: float) -> Mode
         """Return the highest degree at which a splat for each Gaussian is within the growth, and how many are."""
         # Degree 0 always fits: no Gaussian of the model is smaller.
         for degree in range(highest, -1, -1):
-            most = int(growth * model.num_bytes / (BYTES_PER_FLOAT * floats_per_gaussian(degree)))
+            most = int(growth * model.num_bytes / bytes_per_gaussian(degree))
             if most >= model.num or degree == 0:
                 break
         return degree, most
@@ -121,7 +124,8 @@ def split_splats(model: Model, cameras: Sequence[Camera], growth: float) -> Mode
         shown = np.einsum("ntsc,tv,su->nvuc", texels, *at_centers)
         if options.outside == "identity":
             shares_v, shares_u = (shares_inside(side, options) for side in size)
-            shown = np.asarray(NEUTRAL_TEXEL) + (shares_v[:, None] * shares_u)[..., None] * (shown - NEUTRAL_TEXEL)
+            neutral = np.asarray(Textures.padding)
+            shown = neutral + (shares_v[:, None] * shares_u)[..., None] * (shown - neutral)
         pieces.append(_grid(parents, shapes, shown, *axes))
     joined: Gaussians = jax.tree.map(lambda *parts: jnp.concatenate(parts), *pieces)
     # Fainter splats are skipped by every renderer, and would only take bytes.
@@ -176,9 +180,10 @@ def _masses(num: int, options: TextureOptions) -> tuple[np.ndarray, np.ndarray]:
 
 def _weights(u: np.ndarray, num: int, options: TextureOptions) -> np.ndarray:
     """Return the bilinear weights [num, Q] of texels at points of an axis."""
-    place = np.asarray(texel_coordinates(jnp.asarray(u), jnp.asarray(float(num)), options), np.float64)
+    line = TextureRegion(jnp.int32(0), jnp.int32(1), jnp.int32(num))
+    place, _ = Texture(options=options).position(line, jnp.asarray(u), jnp.asarray(u))
     # Clamped coordinates give the outer texels all of the edge, so that the weights add up to 1.
-    return np.maximum(0.0, 1 - np.abs(place[None] - np.arange(num)[:, None]))
+    return np.maximum(0.0, 1 - np.abs(np.asarray(place, np.float64)[None] - np.arange(num)[:, None]))
 
 
 def _grid(parents: Gaussians, shapes: np.ndarray | None, texels: np.ndarray, v: Kernels, u: Kernels) -> Gaussians:
@@ -192,7 +197,7 @@ def _grid(parents: Gaussians, shapes: np.ndarray | None, texels: np.ndarray, v: 
     if shapes is None:
         falloff = np.exp(-0.5 * rho)
     else:
-        falloff = np.asarray(falloff_of(curves_of(jnp.asarray(shapes)[:, None, None]), jnp.asarray(rho)[None]), float)
+        falloff = np.asarray(Exponents(jnp.asarray(shapes)[:, None, None]).falloff(jnp.asarray(rho)[None]), float)
     shown = np.asarray(parents.opacities, np.float64)[:, None, None] * texels[..., 3] * falloff
     # Overlapping alphas multiply as 1 − alpha: their optical depths −log(1 − alpha) add up.
     depths = -np.log1p(-np.clip(shown, 0, MOST_ALPHA))
@@ -205,7 +210,7 @@ def _grid(parents: Gaussians, shapes: np.ndarray | None, texels: np.ndarray, v: 
     unmixed_depths = np.einsum("vw,nwx,xu->nvu", unmixed[0], depths, unmixed[1].T)
     # The inverse may give negative depths next to opaque texels.
     alphas = np.clip(1 - np.exp(-np.maximum(unmixed_depths, 0)), 1e-6, MOST_ALPHA).reshape(-1)
-    axes = np.asarray(rotation_matrices(parents.quats))[:, :, :2] * np.asarray(parents.scales)[:, None, :]
+    axes = np.asarray(parents.rotations)[:, :, :2] * np.asarray(parents.scales)[:, None, :]
     means = np.asarray(parents.means)[:, None] + np.einsum("nxk,pk->npx", axes, places)
     several = functools.partial(np.repeat, repeats=tv * tu, axis=0)
     sh = several(np.asarray(parents.sh))

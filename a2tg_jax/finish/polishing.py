@@ -16,11 +16,9 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from a2tg_jax import Camera, Model, RenderSettings, View, plan_render
-from a2tg_jax.appearance import in_words
 from a2tg_jax.appearance.base import color_sums
 from a2tg_jax.appearance.parts import MAX_DEGREE
 from a2tg_jax.base.checks import check_kind
-from a2tg_jax.core.optim import solve_cg
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.scene import check_are_views, views_by_kind
 from a2tg_jax.training.batches import Photographs, over_background, stack_views
@@ -62,7 +60,7 @@ def polish(
     check_are_views(views, "polish(model, scene.train)")
     if not model.appearance.is_linear:
         raise ValueError(
-            f"a picture is not linear in the colours of {in_words(model.appearance)}: Gaussians with or without "
+            f"a picture is not linear in the colours of {model.appearance.description}: Gaussians with or without "
             "textures of signed RGB can be polished"
         )
     model = model.live
@@ -107,10 +105,12 @@ def _solve(
         return over_background(view.images, view.alphas, background) - output.color
 
     def normal(change: Colors) -> Colors:
-        return pulled(lambda camera, _: draw_change(model, change, camera, settings))
+        back = pulled(lambda camera, _: draw_change(model, change, camera, settings))
+        return jax.tree.map(lambda of_back, of_change: of_back + ridge * of_change, back, change)
 
     # Normal equations (JᵀWJ + ridge)·d = JᵀW·(photograph − picture); tol 0: always num_steps steps.
-    return solve_cg(normal, pulled(missing), ridge=ridge, maxiter=num_steps, tol=0.0)
+    changes, _ = jax.scipy.sparse.linalg.cg(normal, pulled(missing), maxiter=num_steps, tol=0.0)
+    return changes
 
 
 def draw_change(model: Model, change: Colors, camera: Camera, settings: RenderSettings) -> Array:

@@ -20,7 +20,6 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from a2tg_jax import Camera, Gaussians, Model, RenderSettings, Textures, View, plan_render
-from a2tg_jax.appearance import in_words
 from a2tg_jax.core.origin import Color
 from a2tg_jax.core.sh import SH_C0
 from a2tg_jax.core.table import Group
@@ -29,7 +28,7 @@ from a2tg_jax.model import check_is_model
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.render import background_array
 from a2tg_jax.scene import check_are_views
-from a2tg_jax.texture import BYTES_PER_TEXEL, NEUTRAL_TEXEL
+from a2tg_jax.texture import BYTES_PER_TEXEL
 
 LEAST_OPACITY = 1e-4
 """Smallest opacity after absorbing a texel's alpha, and distance of the largest from 1: logits must be finite."""
@@ -62,7 +61,7 @@ def shrink_textures(
         raise ValueError(f"max_loss must be at least 0 dB; got {max_loss}")
     if not can_shrink(model):
         raise ValueError(
-            f"{in_words(model.appearance)} cannot shrink: only textures with signed RGB and projected alpha can"
+            f"{model.appearance.description} cannot shrink: only textures with signed RGB and projected alpha can"
         )
     model = model.live
     if background is None:
@@ -124,7 +123,7 @@ def halve_textures(model: Model, weights: Textures) -> Step:
     gaussians = model.gaussians
     halved: list[Group] = []
     cost = np.zeros(textures.num)
-    single = np.tile(np.asarray(NEUTRAL_TEXEL, np.float64), (textures.num, 1))
+    single = np.tile(np.asarray(Textures.padding, np.float64), (textures.num, 1))
     for (ids, texels), (_, visible) in zip(textures.groups(), weights.groups(), strict=True):
         # The reverse of doubling: odd sides were never doubled.
         axes = [axis for axis in (1, 2) if texels.shape[axis] > 1 and texels.shape[axis] % 2 == 0]
@@ -202,7 +201,7 @@ def fewest_texels(textures: Textures, weights: Textures, most: int) -> list[Grou
     """
     start: list[Group] = []
     for (ids, texels), (_, squares) in zip(textures.groups(), weights.groups(), strict=True):
-        weighted = np.tile(np.asarray([*NEUTRAL_TEXEL, LEAST_WEIGHT]), (len(ids), 1, 1, 1))
+        weighted = np.tile(np.asarray([*Textures.padding, LEAST_WEIGHT]), (len(ids), 1, 1, 1))
         if texels.size:
             # The visibility becomes a fifth channel, which is added up where texels are joined.
             visible = squares.astype(np.float64).sum(axis=-1, keepdims=True) + LEAST_WEIGHT

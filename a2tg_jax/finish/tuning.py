@@ -21,6 +21,7 @@ from a2tg_jax import (
     Change,
     Correction,
     DivergedError,
+    Exponents,
     Gaussians,
     Model,
     Now,
@@ -34,8 +35,7 @@ from a2tg_jax import (
     partition,
     pytree,
 )
-from a2tg_jax.appearance import in_words, template_of
-from a2tg_jax.appearance.parts import LARGEST_LOG_EXPONENT, MAX_DEGREE, MOST_SHARE
+from a2tg_jax.appearance.parts import MAX_DEGREE
 from a2tg_jax.base.checks import check_untraced
 from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.core.gaussians import logit
@@ -170,10 +170,10 @@ class GridRounding:
         textures = shown.textures
         if textures is not None:
             shown = shown.with_textures(dataclasses.replace(textures, buckets=tuple(map(texels, textures.buckets))))
-        if shown.shapes is not None and "shapes" in steps:
-            # The file has steps of log-exponents; arctanh needs shares inside ±1.
-            shares = nearest("shapes", LARGEST_LOG_EXPONENT * jnp.tanh(shown.shapes)) / LARGEST_LOG_EXPONENT
-            shown = shown.with_shapes(jnp.arctanh(jnp.clip(shares, -MOST_SHARE, MOST_SHARE)))
+        if shown.exponents is not None and "shapes" in steps:
+            # The file has steps of logarithms.
+            rounded_exponents = Exponents.of_logarithms(nearest("shapes", shown.exponents.logarithms))
+            shown = dataclasses.replace(shown, exponents=rounded_exponents)
         rounded = Gaussians(means, quats, log_scales, logits, bands(gaussians.sh, 0))
         return dataclasses.replace(model, gaussians=rounded, appearance=shown)
 
@@ -290,9 +290,9 @@ def tune_compact(
     check_encodable(model.appearance)
     if iterations < 1:
         raise ValueError(f"iterations must be at least 1; got {iterations}")
-    if template_of(model.appearance) != stage.appearance:
-        wanted = in_words(stage.appearance)
-        shown = in_words(model.appearance)
+    if model.appearance.template != stage.appearance:
+        wanted = stage.appearance.description
+        shown = model.appearance.description
         if shown == wanted:
             shown += " with other options"
         raise ValueError(

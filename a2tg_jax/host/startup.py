@@ -5,7 +5,7 @@ from pathlib import Path
 
 from jaxlib.version import __version__ as jaxlib_version
 
-from a2tg_jax.base import machine
+from a2tg_jax.base import threads
 from a2tg_jax.base.machine import cache_folder, processor_features, processor_key
 
 CHECKED_JAX_VERSIONS = ((0, 10), (0, 11), (0, 12))
@@ -38,8 +38,8 @@ def configure_cpu(*, use_cache: bool = True, num_threads: int | None = None) -> 
     import jax  # Only here, as in `base.machine`.
 
     if num_threads is not None:
-        machine.set_num_threads(num_threads)
-    machine.num_threads()  # Raises if the number in the environment is wrong.
+        threads.set_num_threads(num_threads)
+    threads.num_threads()  # Raises if the number in the environment is wrong.
     features = processor_features()
     add_xla_flags(cpu_flags(features, jax.__version_info__[:2]))
     if use_cache and jax.config.values["jax_compilation_cache_dir"] is None:

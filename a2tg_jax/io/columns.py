@@ -19,7 +19,8 @@ import numpy as np
 import zstandard
 from PIL import Image
 
-from a2tg_jax.base.json_text import numbers_of
+from a2tg_jax.appearance.parts import MOST_TANH
+from a2tg_jax.base.json_text import number_array
 
 Precision = int | Literal["float32", "float16"]
 Choice = Literal["smallest", "lzma", "zstd", "webp", "deflate", "none"]
@@ -27,6 +28,8 @@ Choice = Literal["smallest", "lzma", "zstd", "webp", "deflate", "none"]
 CODERS = ("lzma", "zstd", "deflate", "none", "webp")
 # Codes of 16 bits fit two planes, and keys of three axes, 48 bits, an int64.
 MOST_BITS = 16
+MOST_LOG_EXPONENT = 1.5
+"""Largest logarithm of an exponent that is read: half the coarsest step beyond the range."""
 LEAST_OPACITY = 1e-7
 ZSTD_LEVEL = 19  # Higher levels are zstd's "ultra", whose windows cost readers more memory.
 LZMA_FILTERS = [
@@ -200,6 +203,20 @@ def logits_of(opacities: np.ndarray) -> np.ndarray:
     # Bits may round an opacity to exactly 0 or 1, whose logit is infinite.
     inside = np.clip(opacities.astype(np.float64), LEAST_OPACITY, 1 - LEAST_OPACITY)
     return np.log(inside) - np.log1p(-inside)
+
+
+def log_exponents_of(shapes: np.ndarray) -> np.ndarray:
+    """Return the logarithms of the exponents of kernels' shapes, within ±1, float64."""
+    return np.tanh(np.asarray(shapes, np.float64))
+
+
+def shapes_of(log_exponents: np.ndarray) -> np.ndarray:
+    """Return the shapes of kernels of logarithms of exponents, float64. Logarithms that rounding has moved beyond ±1
+    are cut to ±1; ValueError: one is NaN or farther out than rounding moves it."""
+    logarithms = np.asarray(log_exponents, np.float64)
+    if not (np.abs(logarithms) <= MOST_LOG_EXPONENT).all():
+        raise ValueError("the logarithms of the exponents of kernels must be within ±1")
+    return np.arctanh(np.clip(logarithms, -MOST_TANH, MOST_TANH))
 
 
 def with_w(xyz: np.ndarray) -> np.ndarray:
@@ -468,7 +485,7 @@ class ColumnReader:
         return _finite("means", np.stack(axes))
 
     def _ends(self, name: str, count: int) -> list[float]:
-        return numbers_of(self._ends_by_name[name], count, f"the ends of {name}").tolist()
+        return number_array(self._ends_by_name[name], count, f"the ends of {name}").tolist()
 
 
 def _finite(name: str, values: np.ndarray, dtype: Any = np.float32) -> np.ndarray:

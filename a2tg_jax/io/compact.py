@@ -16,7 +16,7 @@ from typing import Any, Self
 import numpy as np
 
 from a2tg_jax import Appearance, Model
-from a2tg_jax.appearance.parts import MAX_DEGREE, log_exponents_of, shapes_of
+from a2tg_jax.appearance.parts import MAX_DEGREE
 from a2tg_jax.base.atomic import write_whole
 from a2tg_jax.base.checks import check_int, check_literal
 from a2tg_jax.base.config_json import config_from_dict, config_to_dict
@@ -24,7 +24,6 @@ from a2tg_jax.base.json_text import parse_json
 from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.regular_files import existing_bytes, expanded, reading, room_of
 from a2tg_jax.base.suffixes import check_suffix
-from a2tg_jax.core.gaussians import check_gaussians
 from a2tg_jax.io.columns import (
     MOST_BITS,
     AxisSteps,
@@ -34,13 +33,15 @@ from a2tg_jax.io.columns import (
     Precision,
     decode,
     ends_of,
+    log_exponents_of,
     logits_of,
     morton,
     opacities_of,
+    shapes_of,
     with_w,
 )
 from a2tg_jax.io.model_rows import Rows, check_encodable, joined_rows, model_of, ordered, rows_of_model
-from a2tg_jax.model import check_is_model
+from a2tg_jax.model import check_is_model, checked_live
 from a2tg_jax.model_file import (
     appearance_from_dict,
     appearance_to_dict,
@@ -202,9 +203,8 @@ def encode_model(
       floaters: `floater_scores` of the rows that exist, which the viewer compares with a limit.
     """
     choices.check()
-    check_gaussians(model.gaussians, "model.gaussians")
     check_encodable(model.appearance)
-    model = model.live
+    model = checked_live(model)
     rows = rows_of_model(model)
     num = len(rows.means)
     # A page draws after a sixteenth of a small scene; chunks of a large one are short enough to draw after each.

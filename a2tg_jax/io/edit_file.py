@@ -10,7 +10,7 @@ import numpy as np
 
 from a2tg_jax import Model, Origin, Similarity
 from a2tg_jax.base.atomic import write_whole
-from a2tg_jax.base.json_text import numbers_of
+from a2tg_jax.base.json_text import number_array
 from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.text import shortened
 from a2tg_jax.core.origin import Color
@@ -118,13 +118,13 @@ def _edit_of(data: dict[str, Any]) -> Edit:
         crop = _box_of(crop)
     up = data.get("up")
     if up is not None:
-        up = numbers_of(up, 3, "up")
+        up = number_array(up, 3, "up")
         if not np.linalg.norm(up) > 0:
             raise ValueError("up must not be zero")
         up = up / np.linalg.norm(up)
     background = data.get("background")
     if background is not None:
-        red, green, blue = numbers_of(background, 3, "background").tolist()
+        red, green, blue = number_array(background, 3, "background").tolist()
         background = (red, green, blue)
     return Edit(crop, float(floaters), up, background)
 
@@ -135,10 +135,10 @@ def _box_of(crop: object) -> Box:
     rows = crop.get("axes", np.eye(3).tolist())
     if not isinstance(rows, list) or len(rows) != 3:
         raise ValueError(f"crop.axes must be 3 directions; got {shortened(rows)}")
-    axes = np.stack([numbers_of(row, 3, "crop.axes") for row in rows])
+    axes = np.stack([number_array(row, 3, "crop.axes") for row in rows])
     check_similarity(Similarity(1.0, axes, np.zeros(3)), "crop.axes")
-    low = numbers_of(crop.get("low"), 3, "crop.low", null=-math.inf)
-    high = numbers_of(crop.get("high"), 3, "crop.high", null=math.inf)
+    low = number_array(crop.get("low"), 3, "crop.low", null=-math.inf)
+    high = number_array(crop.get("high"), 3, "crop.high", null=math.inf)
     return Box(axes, low, high)
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from a2tg_jax import Model, load_model, save_model
 from a2tg_jax.base.regular_files import expanded, is_regular
 from a2tg_jax.base.text import did_you_mean, shortened
-from a2tg_jax.core.origin import BLACK
 from a2tg_jax.data.other_runs import HOW_TO_EXPORT, model_hint
 from a2tg_jax.io.compact import load_compact, save_compact
 from a2tg_jax.io.gltf import load_gltf, save_gltf
@@ -219,7 +218,7 @@ def lost_by(model: Model, path: str | os.PathLike[str]) -> list[str]:
     if not into.keeps_origin:
         if origin is not None and origin.names:
             lost.append("cameras and background")
-        elif model.background != BLACK:
+        elif any(model.background):
             lost.append("background")
     if origin is not None and not into.keeps_corrections:
         lost += [LEARNED.get(name, f"learned {name}") for name in sorted(origin.corrections)]

@@ -12,18 +12,16 @@ from typing import Any, Literal
 
 import numpy as np
 
-from a2tg_jax import Appearance, Model, TextureOptions
-from a2tg_jax.appearance import appearance_for
-from a2tg_jax.appearance.base import PARTS
-from a2tg_jax.appearance.parts import MAX_DEGREE, log_exponents_of, shapes_of
+from a2tg_jax import Appearance, Bands, Exponents, Model, Texture, TextureOptions
+from a2tg_jax.appearance.parts import MAX_DEGREE
 from a2tg_jax.base.checks import check_int, check_literal
 from a2tg_jax.base.config_json import config_from_dict
-from a2tg_jax.base.json_text import numbers_of
+from a2tg_jax.base.json_text import number_array
 from a2tg_jax.base.regular_files import expanded, reading
 from a2tg_jax.base.suffixes import check_suffix
 from a2tg_jax.base.text import shortened
 from a2tg_jax.core.sh import NUM_BASES, SH_C0
-from a2tg_jax.io.columns import Ends, dequantised, ends_of, quantised
+from a2tg_jax.io.columns import Ends, dequantised, ends_of, log_exponents_of, quantised, shapes_of
 from a2tg_jax.io.gltf_container import Builder, Document, mesh_nodes, scene_of_one
 from a2tg_jax.io.model_rows import Rows, check_encodable, model_of, rows_of_model
 from a2tg_jax.io.other_programs import (
@@ -279,7 +277,12 @@ def _shown(document: Document, described: Mapping[str, Any], splats: Ellipsoids)
     options = config_from_dict(TextureOptions, names, EXTENSION)
     if not 0 < options.max_alpha < 1:
         raise ValueError(f"{EXTENSION}.maxAlpha must be in (0, 1); got {options.max_alpha!r}")
-    appearance = appearance_for(options, has_textures=has_textures, has_degrees=has_degrees, has_shapes=has_shapes)
+    appearance = Appearance(
+        texture=Texture(options=options) if has_textures else None,
+        exponents=Exponents() if has_shapes else None,
+        bands=Bands() if has_degrees else None,
+        max_alpha=None if has_textures else options.max_alpha,
+    )
 
     def integers(name: str, kind: str, most: int) -> np.ndarray:
         values = document.numbers(described[name], kind, f"{EXTENSION}.{name}")
@@ -323,7 +326,7 @@ def _texels(document: Document, described: Mapping[str, Any], count: int) -> np.
     if len(texels) != count:
         raise ValueError(f"{EXTENSION}.sizes need {count} texels, but there are {len(texels)}")
     for name, columns in RANGES.items() if "texelRanges" in described else ():
-        ends = numbers_of(described["texelRanges"][name], 2, f"{EXTENSION}.texelRanges.{name}").tolist()
+        ends = number_array(described["texelRanges"][name], 2, f"{EXTENSION}.texelRanges.{name}").tolist()
         texels[:, columns] = dequantised(texels[:, columns] * 255.0, Ends(*ends), 8)
     return texels
 
@@ -340,7 +343,7 @@ def _kept_appearance(kept: Mapping[str, Any], shown: Appearance, *, is_described
         return shown
     appearance = appearance_from_dict(kept["appearance"])
     # Extras may be out of date if another program has edited the extension: then this decides.
-    is_same = all((getattr(appearance, part) is None) == (getattr(shown, part) is None) for part in PARTS)
+    is_same = appearance.description == shown.description
     if is_described:
         is_same &= appearance.alpha_limit == shown.alpha_limit
         saved = appearance.texture_options

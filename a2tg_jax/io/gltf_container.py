@@ -19,7 +19,7 @@ import numpy as np
 
 from a2tg_jax.base.atomic import replacing, write_whole
 from a2tg_jax.base.checks import check_int
-from a2tg_jax.base.json_text import numbers_of, parse_json
+from a2tg_jax.base.json_text import number_array, parse_json
 from a2tg_jax.base.regular_files import (
     LARGEST_RATIO,
     MOST_ARRAY_BYTES,
@@ -360,7 +360,7 @@ def _local_matrix(node: Mapping[str, Any]) -> np.ndarray:
     """Return the matrix [4, 4] from a node to its parent, for columns."""
 
     def vector(name: str, default: list[float]) -> np.ndarray:
-        return numbers_of(node.get(name, default), len(default), f"{name} of a node")
+        return number_array(node.get(name, default), len(default), f"{name} of a node")
 
     if "matrix" in node:
         # Column by column in the file.

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax import Appearance, Gaussians, Model, Origin
-from a2tg_jax.appearance import in_words
 from a2tg_jax.appearance.files import arrays_of, with_arrays
 from a2tg_jax.core.origin import Color
 from a2tg_jax.core.sh import NUM_BASES
@@ -64,14 +63,13 @@ def check_encodable(
     """Raise ValueError, with the alternative, unless a file can hold an appearance."""
     if not appearance.is_portable:
         raise ValueError(
-            f"model has {in_words(appearance)}: {file} holds Gaussians with or without textures, exponents and "
+            f"model has {appearance.description}: {file} holds Gaussians with or without textures, exponents and "
             f"bands; {instead}"
         )
 
 
 def rows_of_model(model: Model) -> Rows:
-    """Return the tables of a model without unused rows, in its order. Raises as `check_model`."""
-    check_model(model)
+    """Return the tables of a valid model without unused rows, in its order."""
     gaussians = model.gaussians
     shown = arrays_of(model.appearance, gaussians.sh_degree)
     sh = np.asarray(gaussians.sh)

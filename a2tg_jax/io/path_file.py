@@ -6,7 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from a2tg_jax import Camera
-from a2tg_jax.base.json_text import numbers_of
+from a2tg_jax.base.json_text import number_array
 from a2tg_jax.base.text import shortened
 from a2tg_jax.core.cameras import check_calibration, check_camera
 from a2tg_jax.io.saved_file import load_saved
@@ -32,9 +32,9 @@ def _cameras(data: dict[str, Any]) -> list[Camera]:
 def _camera(view: object, where: str) -> Camera:
     if not isinstance(view, dict):
         raise ValueError(f"{where} must be an object; got {shortened(view)}")
-    viewmat = numbers_of(view.get("viewmat"), 16, f"{where}.viewmat").reshape(4, 4)
-    K = numbers_of(view.get("K"), 9, f"{where}.K").reshape(3, 3)
-    width, height = numbers_of(view.get("size"), 2, f"{where}.size")
+    viewmat = number_array(view.get("viewmat"), 16, f"{where}.viewmat").reshape(4, 4)
+    K = number_array(view.get("K"), 9, f"{where}.K").reshape(3, 3)
+    width, height = number_array(view.get("size"), 2, f"{where}.size")
     if not all(1 <= side <= LARGEST_SIDE and side == int(side) for side in (width, height)):
         raise ValueError(f"{where}.size must be 1 to {LARGEST_SIDE} pixels; got {width:g} and {height:g}")
     check_calibration(viewmat, K, int(width), int(height), where)

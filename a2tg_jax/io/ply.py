@@ -29,7 +29,6 @@ from a2tg_jax.appearance.parts import LEAST_OPACITY
 from a2tg_jax.base.atomic import write_whole
 from a2tg_jax.base.regular_files import check_exists, expanded, open_regular, reading
 from a2tg_jax.base.suffixes import check_suffix
-from a2tg_jax.core.gaussians import rotation_matrices
 from a2tg_jax.core.sh import NUM_BASES, SH_C0
 from a2tg_jax.data.other_runs import model_hint
 from a2tg_jax.data.ply import OFFSET, RGB, ROTATION, SH_DEGREE0, PlyFile, largest_color
@@ -141,7 +140,7 @@ def encode_ply(
         log_scales = np.concatenate([log_scales, third], axis=1)
     columns = [
         # Normals: the third column of each rotation.
-        np.asarray(rotation_matrices(gaussians.quats)[:, :, 2]),
+        np.asarray(gaussians.rotations[:, :, 2]),
         sh[:, 0],
         rest,
         np.asarray(gaussians.logit_opacities)[:, None],

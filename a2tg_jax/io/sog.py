@@ -25,7 +25,7 @@ from scipy import sparse
 
 from a2tg_jax import Model
 from a2tg_jax.base.checks import check_int
-from a2tg_jax.base.json_text import numbers_of, parse_json
+from a2tg_jax.base.json_text import number_array, parse_json
 from a2tg_jax.base.regular_files import existing_bytes, read_regular, reading, room_of
 from a2tg_jax.base.text import PROGRAM, shortened
 from a2tg_jax.core.sh import NUM_BASES
@@ -292,10 +292,10 @@ def _decoded(header: Mapping[str, Any], group: str, codes: np.ndarray, *, is_fir
         return low + codes / 255 * (high - low)
     codebook = described.get("codebook")
     if isinstance(codebook, list) and len(codebook) == CODEBOOK and codebook[0] is None:
-        _, second, *_, last = numbers_of(codebook, CODEBOOK, f"{group}.codebook of {HEADER}", null=0.0).tolist()
+        _, second, *_, last = number_array(codebook, CODEBOOK, f"{group}.codebook of {HEADER}", null=0.0).tolist()
         # Early programs left the first number out: https://github.com/playcanvas/engine reads it as one more step.
         codebook = [second + (second - last) / (CODEBOOK - 1), *codebook[1:]]
-    book = numbers_of(codebook, None, f"{group}.codebook of {HEADER}")
+    book = number_array(codebook, None, f"{group}.codebook of {HEADER}")
     if codes.max() >= len(book):
         raise ValueError(f"{group}.codebook of {HEADER} has {len(book)} numbers, but a pixel refers to {codes.max()}")
     return book[codes]
@@ -304,7 +304,7 @@ def _decoded(header: Mapping[str, Any], group: str, codes: np.ndarray, *, is_fir
 def _numbers(described: Mapping[str, Any], name: str, count: int, group: str = "") -> np.ndarray:
     """Return a field of `count` numbers; one may be without a list."""
     values = described.get(name)
-    return numbers_of(values if isinstance(values, list) else [values], count, f"{group}{name} of {HEADER}")
+    return number_array(values if isinstance(values, list) else [values], count, f"{group}{name} of {HEADER}")
 
 
 # Writing

@@ -24,7 +24,6 @@ from a2tg_jax.base.npz import read_npz
 from a2tg_jax.base.regular_files import MOST_ARRAY_BYTES, check_exists, expanded, open_regular, reading
 from a2tg_jax.base.suffixes import check_suffix
 from a2tg_jax.base.text import shortened
-from a2tg_jax.core.origin import BLACK
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.io import usd_fields
 from a2tg_jax.io.other_programs import (
@@ -129,7 +128,7 @@ def _stage_of(model: Model, ellipsoids: bool) -> Any:
         corners = np.stack([(splats.means - reach).min(axis=0), (splats.means + reach).max(axis=0)])
         field.CreateExtentAttr(usd.Vt.Vec3fArray.FromNumpy(corners))
     kept = {} if model.origin is None else origin_to_json(model.origin)
-    if kept or model.background != BLACK:
+    if kept or any(model.background):
         kept |= {"background": list(model.background)}
         prim.SetCustomDataByKey(ORIGIN, json.dumps(kept, allow_nan=False))
     return stage
@@ -213,7 +212,7 @@ def _model_of(field: Mapping[str, Any], arrays: Mapping[str, np.ndarray], prefix
     scales = column("scales", (1.0, 1.0, 1.0))
     opacities = column("opacities", (1.0,))[:, 0]
     splats = Ellipsoids(means, quats, scales, opacities, sh)
-    kept = {"background": BLACK} if field["origin"] is None else parse_json(field["origin"])
+    kept = {"background": (0.0, 0.0, 0.0)} if field["origin"] is None else parse_json(field["origin"])
     # A model without an origin has a background alone.
     origin = None if set(kept) == {"background"} else origin_of(kept, kept)
     is_flat = SURFLET in kernels

@@ -9,14 +9,13 @@ import dataclasses
 import numpy as np
 
 from a2tg_jax import Model
-from a2tg_jax.core.gaussians import check_gaussians
 from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.data.capture_geometry import central_camera
 from a2tg_jax.io.columns import Choice, opacities_of
 from a2tg_jax.io.compact import CompactChoices, encode_model
 from a2tg_jax.io.edit_file import scores_of
 from a2tg_jax.io.model_rows import check_encodable
-from a2tg_jax.model import check_model
+from a2tg_jax.model import checked_live
 
 CHOICES = CompactChoices(
     means=16, log_scales=8, quats=8, opacities=8, sh_0=8, sh_rest=6, texels=8, shapes=8, coder="deflate"
@@ -46,10 +45,8 @@ def encode_web_scene(
     Raises:
       ValueError: if the model has another appearance, too many rows, or a number that is not finite.
     """
-    check_gaussians(model.gaussians, "model.gaussians")
     check_encodable(model.appearance, "a file for browsers")
-    model = model.live
-    check_model(model)
+    model = checked_live(model)
     scores = scores_of(model)  # Of the model as `apply_edit` has it.
     texture = model.appearance.texture
     if texture is not None and model.num:

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from a2tg_jax import RestOfRun, Scene, View
-from a2tg_jax.base.machine import allowed_memory, default_platform, used_memory
+from a2tg_jax.base.machine import default_platform
+from a2tg_jax.base.memory import allowed_memory, used_memory
 from a2tg_jax.base.text import in_bytes
 from a2tg_jax.data.photo_store import SHARE_OF_MEMORY
 from a2tg_jax.results.commands import QUICK_SIDE, quick_flags

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from a2tg_jax import Origin, Renderer, view_image
-from a2tg_jax.base.machine import memory_limit
+from a2tg_jax.base.memory import memory_limit
 from a2tg_jax.base.text import budget_in_bytes, counted, in_bytes
 from a2tg_jax.host.progress_bars import progress_over
 from a2tg_jax.mesh.extract import check_lengths, extract_mesh

@@ -19,7 +19,7 @@ import jax
 from PIL import Image
 
 from a2tg_jax import Model, Origin, Scene, View, view_image
-from a2tg_jax.core.origin import BLACK, Color
+from a2tg_jax.core.origin import Color
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.results.images import to_uint8
 from a2tg_jax.results.model_source import Source
@@ -46,7 +46,12 @@ WAIT = 0.1
 class CameraPhotographs:
     """Photographs of a model's cameras as JPEG, read on demand; RGB `background` is behind transparent ones."""
 
-    def __init__(self, origin: Origin | None, load_scene: Callable[[], Scene | None], background: Color = BLACK):
+    def __init__(
+        self,
+        origin: Origin | None,
+        load_scene: Callable[[], Scene | None],
+        background: Color = (0.0, 0.0, 0.0),
+    ):
         self._names = () if origin is None else origin.names
         self._load_scene = load_scene
         self._background = background

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple, Self
 import jax.numpy as jnp
 
 from a2tg_jax.appearance import Appearance, Exponents
-from a2tg_jax.appearance.parts import LARGEST_LOG_EXPONENT, MOST_SHARE
+from a2tg_jax.appearance.parts import shapes_of
 from a2tg_jax.base.checks import check_number
 from a2tg_jax.base.text import shortened
 from a2tg_jax.core.optim import AdamState
@@ -115,8 +115,7 @@ class LimitExponents(StepEvent):
         shapes = model.appearance.shapes
         if shapes is None:
             raise ValueError("LimitExponents needs kernels with exponents, such as Appearance(exponents=Exponents())")
-        share = jnp.log(jnp.asarray(self.least, shapes.dtype)) / LARGEST_LOG_EXPONENT
-        least = jnp.arctanh(jnp.clip(share, -MOST_SHARE, MOST_SHARE))
+        least = shapes_of(jnp.log(jnp.asarray(self.least, shapes.dtype)))
         appearance = model.appearance.with_shapes(jnp.maximum(shapes, least))
         return Change(dataclasses.replace(model, appearance=appearance), moments, state)
 

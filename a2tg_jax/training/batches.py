@@ -11,7 +11,8 @@ from jax import Array
 from jax.sharding import Mesh
 from numpy.typing import DTypeLike
 
-from a2tg_jax.base.machine import default_device, num_threads
+from a2tg_jax.base.machine import default_device
+from a2tg_jax.base.threads import num_threads
 from a2tg_jax.parallel import any_process, everywhere, of_views, views_here
 from a2tg_jax.scene import Kind, View, kinds_of, ray_bytes
 

@@ -6,7 +6,8 @@ from collections.abc import Iterator, Sequence
 
 import jax
 
-from a2tg_jax.base.machine import Devices, allowed_memory, default_platform, used_memory
+from a2tg_jax.base.machine import Devices, default_platform
+from a2tg_jax.base.memory import allowed_memory, used_memory
 from a2tg_jax.base.text import in_bytes
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.gaussians import floats_per_gaussian

@@ -18,7 +18,7 @@ from a2tg_jax.base.machine import Devices
 from a2tg_jax.base.text import in_bytes
 from a2tg_jax.core.compilations import compilations
 from a2tg_jax.core.numerics import evenly_chosen
-from a2tg_jax.core.table import Shape
+from a2tg_jax.core.table import Layout
 from a2tg_jax.events import Due, HostEvent, StepEvent
 from a2tg_jax.model import Model
 from a2tg_jax.parallel import any_process, divided, everywhere, mesh_of, num_processes, whole
@@ -122,7 +122,7 @@ class Session:
         processes = num_processes(self.mesh)
         self.devices = Devices(self.num_devices // processes, processes)
         """Numbers of devices of a process and of processes."""
-        self.shapes: set[Shape] = set()
+        self.layouts: set[Layout] = set()
         """Shapes of textures."""
         self.room = TileRoom()
         """Capacities of tile lists, by appearance, rows and image size."""
@@ -332,7 +332,7 @@ class StageRun:
         arguments = self.arguments(iteration)
         started = time.perf_counter()
         info: StepInfo
-        with compilations() as programs:
+        with compilations() as phases:
             try:
                 if self.memory is None:
                     # The call that follows finds this program, in JAX's cache of this process.
@@ -344,8 +344,9 @@ class StageRun:
                 self.state, info = jitted_step()(*arguments)
             except ValueError as error:  # The step is not compiled for the name of its stage.
                 raise ValueError(f"stage {self.stage.name!r}: {error}") from error
-        self.effects.launch(iteration, time.perf_counter() - started if programs else None)
-        if programs:
+        is_compiled = any(phase.makes_code for phase in phases)
+        self.effects.launch(iteration, time.perf_counter() - started if is_compiled else None)
+        if is_compiled:
             self.session.after_compiling()
         return info
 
@@ -430,7 +431,7 @@ class StageRun:
     def _apply(self, place: int, event: HostEvent, index: int, count: int) -> None:
         """Apply the event at a place, for the `index`-th of `count` times."""
         due = Due(
-            index, count, self.views, self.system.background_color, self.system.seed, self.session.shapes,
+            index, count, self.views, self.system.background_color, self.system.seed, self.session.layouts,
             self.session.room,
         )  # fmt: skip
         with calling(event, "apply", self.stage.name):

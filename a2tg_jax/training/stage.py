@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import Appearance, allocate_appearance, count_floats, in_words
+from a2tg_jax.appearance import Appearance, allocate_appearance, count_floats
 from a2tg_jax.appearance.base import check_appearance
 from a2tg_jax.base.checks import check_kind, check_literals, check_number, fields_of, kind_of
 from a2tg_jax.base.named_fields import NamedFields
@@ -254,7 +254,7 @@ class Stage(NamedFields):
         check_appearance(self._appearance_of_two, no_rows(2, 1))
         if self.appearance_rate is None and jax.tree.leaves(self._appearance_of_two):
             raise ValueError(
-                f"{where} appearance_rate must be the learning rate of the arrays of {in_words(self.appearance)}, "
+                f"{where} appearance_rate must be the learning rate of the arrays of {self.appearance.description}, "
                 "such as 1e-2, or 0 if they are to stay unchanged; got none"
             )
         if not self.losses:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import Appearance, allocate_appearance, template_of
+from a2tg_jax.appearance import Appearance, allocate_appearance
 from a2tg_jax.appearance.base import check_appearance, join_rows, without_arrays
 from a2tg_jax.appearance.parts import Part, nearest_gaussians
 from a2tg_jax.base.checks import fields_of
@@ -175,7 +175,7 @@ def given_model(start: Model, scene: Scene, system: System, index: int) -> Model
             stacklevel=4,
         )
     _check_seen("start.gaussians.means", np.asarray(start.gaussians.means), scene)
-    template = template_of(start.appearance)
+    template = start.appearance.template
     # The appearance of the stage before is expected as well: this stage replaces it, such as textures by others.
     is_expected = template == stage.appearance or (index > 0 and template == stages[index - 1].appearance)
     if is_expected and start.gaussians.sh_degree == degree:
@@ -365,7 +365,7 @@ def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> 
         spare = no_rows(room - num, gaussians.sh.shape[1], gaussians.means.dtype)
         gaussians = join_rows([gaussians, spare])
     appearance = model.appearance
-    if template_of(appearance) != stage.appearance or room > num:
+    if appearance.template != stage.appearance or room > num:
         allocated = new_appearance(stage.appearance, gaussians, system)
         appearance = dataclasses.replace(allocated, **_kept_fields(appearance, allocated, stage))
         if room > num:
@@ -381,7 +381,7 @@ def _kept_fields(before: Appearance, allocated: Appearance, stage: Stage) -> dic
     warned of others.
     """
     is_related = isinstance(before, type(allocated)) or isinstance(allocated, type(before))
-    is_same = template_of(before) == stage.appearance
+    is_same = before.template == stage.appearance
     kept: dict[str, Any] = {}
     for field in dataclasses.fields(allocated):
         name = field.name

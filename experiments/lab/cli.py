@@ -13,7 +13,8 @@ from typing import Any, NoReturn
 
 import a2tg_jax as a2tg
 from a2tg_jax.base.atomic import replacing
-from a2tg_jax.base.machine import cpu_quota, memory_limit
+from a2tg_jax.base.control_groups import cpu_quota
+from a2tg_jax.base.memory import memory_limit
 from a2tg_jax.base.operating_system import num_cores
 from a2tg_jax.base.text import did_you_mean
 from a2tg_jax.data.synthetic import BUILT_IN

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 from jax import Array
 
 import a2tg_jax as a2tg
-from a2tg_jax.core.gaussians import rotation_matrices
 from a2tg_jax.events import Now
 from a2tg_jax.mcmc import Noise, densify_times, perturb
 from a2tg_jax.rasterize.render_types import RenderOutput
@@ -41,7 +40,7 @@ class Ellipsoids(a2tg.Appearance):
         if camera.rays is not None:
             raise ValueError("ellipsoids are drawn by cameras without distortion only; undistort the photographs")
         _, normals = super().homographies(gaussians, camera)
-        axes = rotation_matrices(gaussians.quats) * self.scales(gaussians)[:, None, :]
+        axes = gaussians.rotations * self.scales(gaussians)[:, None, :]
         to_camera = camera.viewmat[:3, :3]
         K = camera.K
         in_camera = jnp.sum(to_camera[None, :, :, None] * axes[:, None, :, :], axis=2)  # [N, 3, 3]: columns are axes

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 import a2tg_jax as a2tg
-from a2tg_jax.base.machine import num_threads
 from a2tg_jax.base.text import in_bytes
+from a2tg_jax.base.threads import num_threads
 from a2tg_jax.data.synthetic import BUILT_IN
 from a2tg_jax.events import HostEvent
 from lab.grid import Grid, Run

@@ -7,14 +7,9 @@ from typing import Self
 import jax
 import numpy as np
 
+from a2tg_jax.core.compilations import Phase, compilations
 from a2tg_jax.host.progress_bars import ticking
 
-COMPILING = (
-    "/jax/core/compile/jaxpr_trace_duration",
-    "/jax/core/compile/jaxpr_to_mlir_module_duration",
-    "/jax/core/compile/backend_compile_duration",
-)
-"""Events of `jax.monitoring` that make up a compilation. One can lie within another."""
 SAMPLING_SECONDS = 0.05
 
 
@@ -36,13 +31,14 @@ class TrainingTime:
         """Seconds of an interrupted training that the block continues."""
         self._clock = time.process_time if jax.default_backend() == "cpu" else time.perf_counter
         self._samples: list[tuple[float, float]] = []
-        self._compiled: list[tuple[float, float]] = []
+        self._phases: list[Phase] = []
+        self._compiling = compilations()
         self._sampling = ticking(self._sample, SAMPLING_SECONDS)
         self._is_over = False
 
     def __enter__(self) -> Self:
         self._sample()
-        jax.monitoring.register_event_duration_secs_listener(self._on_event)
+        self._phases = self._compiling.__enter__()
         self._sampling.__enter__()
         return self
 
@@ -50,7 +46,7 @@ class TrainingTime:
         self._sampling.__exit__(None, None, None)
         self._sample()
         self._is_over = True
-        jax.monitoring.unregister_event_duration_listener(self._on_event)
+        self._compiling.__exit__(None, None, None)
 
     @property
     def seconds(self) -> float:
@@ -59,18 +55,13 @@ class TrainingTime:
             self._sample()
         samples = list(self._samples)
         at, used = np.array(sorted(samples)).T
-        compiled = union(self._compiled)
+        compiled = union((phase.start, phase.end) for phase in self._phases)
         # Compilations are known by the time on the wall; samples say what the clock showed then.
         compiling = sum(np.interp(end, at, used) - np.interp(start, at, used) for start, end in compiled)
         return self.earlier + float(used[-1] - used[0] - compiling)
 
     def _sample(self) -> None:
         self._samples.append((time.perf_counter(), self._clock()))
-
-    def _on_event(self, event: str, seconds: float, **_: object) -> None:
-        if event in COMPILING:
-            now = time.perf_counter()
-            self._compiled.append((now - seconds, now))
 
 
 def union(intervals: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:

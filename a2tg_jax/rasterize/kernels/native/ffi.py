@@ -31,7 +31,7 @@ import numpy as np
 from jax import Array
 from jax.typing import DTypeLike
 
-from a2tg_jax.base.machine import num_threads as num_threads
+from a2tg_jax.base.threads import num_threads as num_threads
 from a2tg_jax.rasterize.kernels.native import llvm_code
 
 Handler = Callable[[list[np.ndarray], list[np.ndarray]], None]
@@ -52,24 +52,40 @@ _size = ctypes.c_size_t
 _int = ctypes.c_int
 
 
+STRUCTURES: dict[str, Any] = {}
+"""Structures by the names that the header gives them and their fields."""
+
+
 def _structure(name: str, **fields: Any) -> Any:
-    return type(name, (ctypes.Structure,), {"_fields_": (("struct_size", _size), *fields.items())})
+    STRUCTURES[name] = type(name, (ctypes.Structure,), {"_fields_": tuple(fields.items())})
+    return STRUCTURES[name]
 
 
-_Version = _structure("Version", extension=_pointer, major=_int, minor=_int)
-_Metadata = _structure("Metadata", version=_Version, traits=ctypes.c_uint32)
-_Extension = _structure("Extension", kind=_int, next=_pointer, metadata=ctypes.POINTER(_Metadata))
-_ErrorArguments = _structure("ErrorArguments", extension=_pointer, message=ctypes.c_char_p, code=_int)
-_CreateError = ctypes.CFUNCTYPE(_pointer, ctypes.POINTER(_ErrorArguments))
-_Api = _structure("Api", extension=_pointer, version=_Version, internal=_pointer, create_error=_CreateError)
-_Buffer = _structure(
-    "Buffer", extension=_pointer, dtype=_int, data=_pointer, rank=ctypes.c_int64, dims=ctypes.POINTER(ctypes.c_int64)
+_Version = _structure(
+    "XLA_FFI_Api_Version", struct_size=_size, extension_start=_pointer, major_version=_int, minor_version=_int
 )
-_BufferPointers = ctypes.POINTER(ctypes.POINTER(_Buffer))
-_Buffers = _structure("Buffers", extension=_pointer, num=ctypes.c_int64, kinds=_pointer, buffers=_BufferPointers)
+_Metadata = _structure("XLA_FFI_Metadata", struct_size=_size, api_version=_Version, traits=ctypes.c_uint32)
+_ExtensionBase = _structure("XLA_FFI_Extension_Base", struct_size=_size, type=_int, next=_pointer)
+_Extension = _structure("XLA_FFI_Metadata_Extension", extension_base=_ExtensionBase, metadata=ctypes.POINTER(_Metadata))
+_ErrorArguments = _structure(
+    "XLA_FFI_Error_Create_Args", struct_size=_size, extension_start=_pointer, message=ctypes.c_char_p, errc=_int
+)
+_CreateError = ctypes.CFUNCTYPE(_pointer, ctypes.POINTER(_ErrorArguments))
+_Api = _structure(
+    "XLA_FFI_Api", struct_size=_size, extension_start=_pointer, api_version=_Version, internal_api=_pointer,
+    XLA_FFI_Error_Create=_CreateError,
+)  # fmt: skip
+_Buffer = _structure(
+    "XLA_FFI_Buffer", struct_size=_size, extension_start=_pointer, dtype=_int, data=_pointer, rank=ctypes.c_int64,
+    dims=ctypes.POINTER(ctypes.c_int64),
+)  # fmt: skip
+_Buffers = _structure(
+    "XLA_FFI_Args", struct_size=_size, extension_start=_pointer, size=ctypes.c_int64, types=_pointer,
+    args=ctypes.POINTER(ctypes.POINTER(_Buffer)),
+)  # fmt: skip
 _CallFrame = _structure(
-    "CallFrame", extension=ctypes.POINTER(_Extension), api=ctypes.POINTER(_Api), context=_pointer, stage=_int,
-    arguments=_Buffers, results=_Buffers,
+    "XLA_FFI_CallFrame", struct_size=_size, extension_start=ctypes.POINTER(_Extension), api=ctypes.POINTER(_Api),
+    ctx=_pointer, stage=_int, args=_Buffers, rets=_Buffers,
 )  # fmt: skip
 _Entry = ctypes.CFUNCTYPE(_pointer, ctypes.POINTER(_CallFrame))
 _LOCK = threading.RLock()
@@ -149,7 +165,7 @@ inside:
   %result = call ptr inttoptr (i64 {entry} to ptr)(ptr %frame)
   br label %leave
 outside:
-  ; frame->api->create_error(&_AT_THE_END)
+  ; frame->api->XLA_FFI_Error_Create(&_AT_THE_END)
   %api_place = getelementptr i8, ptr %frame, i64 {api}
   %api = load ptr, ptr %api_place
   %create_place = getelementptr i8, ptr %api, i64 {create_error}
@@ -173,7 +189,7 @@ def _gated(entry: Any) -> int:
         name=name,
         entry=ctypes.cast(entry, _pointer).value,
         api=_CallFrame.api.offset,
-        create_error=_Api.create_error.offset,
+        create_error=_Api.XLA_FFI_Error_Create.offset,
         **{field: ctypes.addressof(number) for field, number in places.items()},
     )
     return llvm_code.compile_text(code, [name])[name]
@@ -189,12 +205,12 @@ def _entry(handler: Handler) -> Callable[..., int | None]:
         # No exception may pass through C: it would be lost, and the unfilled results would count as computed.
         try:
             with _interrupts_noted(interrupts):
-                extension = frame.extension
-                if extension and extension.contents.kind == METADATA_EXTENSION:
-                    version = extension.contents.metadata.contents.version
-                    version.major, version.minor = VERSION
+                extension = frame.extension_start
+                if extension and extension.contents.extension_base.type == METADATA_EXTENSION:
+                    version = extension.contents.metadata.contents.api_version
+                    version.major_version, version.minor_version = VERSION
                 elif frame.stage == EXECUTE_STAGE:
-                    handler(_arrays(frame.arguments), _arrays(frame.results))
+                    handler(_arrays(frame.args), _arrays(frame.rets))
             if interrupts:
                 dropped_last.append(_interrupt_once_dropped())
         except BaseException as error:
@@ -205,7 +221,7 @@ def _entry(handler: Handler) -> Callable[..., int | None]:
             message = f"{what}raised, most recent call last, at\n{where}".encode(errors="replace")
             error.with_traceback(None)  # A traceback would keep this function's variables alive.
             arguments = _ErrorArguments(ctypes.sizeof(_ErrorArguments), None, message, INTERNAL_ERROR)
-            address: int = frame.api.contents.create_error(ctypes.byref(arguments))
+            address: int = frame.api.contents.XLA_FFI_Error_Create(ctypes.byref(arguments))
             return address
         return None
 
@@ -237,8 +253,8 @@ def _interrupt_once_dropped() -> object:
 
 def _arrays(buffers: Any) -> list[np.ndarray]:
     arrays = []
-    for index in range(buffers.num):
-        buffer = buffers.buffers[index].contents
+    for index in range(buffers.size):
+        buffer = buffers.args[index].contents
         shape = tuple(buffer.dims[: buffer.rank])
         dtype = np.dtype(DTYPES[buffer.dtype])
         num_bytes = math.prod(shape) * dtype.itemsize
