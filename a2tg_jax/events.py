@@ -17,7 +17,6 @@ import numpy as np
 from jax import Array
 from jax.typing import DTypeLike
 
-from a2tg_jax.appearance import template_of
 from a2tg_jax.appearance.base import clear_rows
 from a2tg_jax.base.checks import check_floats, check_mask, check_shape
 from a2tg_jax.base.named_fields import NamedFields
@@ -127,7 +126,7 @@ class Due(NamedFields):
         cameras = [view.camera for view in views]
         pairs = most_pairs(model.gaussians, cameras, model.appearance, settings, model.num_live)
         # As in the training loop.
-        place = template_of(model.appearance), model.num_rows, *max(view.picture.size for view in views)
+        place = model.appearance.template, model.num_rows, *max(view.picture.size for view in views)
         return dataclasses.replace(settings, capacity=self.room.plan(place, pairs, most=math.inf))
 
 
