@@ -23,8 +23,8 @@ from a2tg_jax.data.capture_geometry import (
     LEAST_FACING,
     camera_centers,
     distance_to_subject,
-    nearest_point,
     outlying_cameras,
+    subject_of,
 )
 from a2tg_jax.data.photo_points import MOST_PLAIN, MOST_VIEWS, Look, agreeing_points, plain_share
 from a2tg_jax.scene import ray_bytes, rays_of_lenses
@@ -403,7 +403,7 @@ def normalizing_similarity(viewmats: np.ndarray) -> Similarity:
     origin becomes 1.
     """
     centers = camera_centers(viewmats)
-    origin = nearest_point(centers, viewmats[:, 2, :3])
+    origin = subject_of(viewmats)
     rotation = np.eye(3)
     # The rows of R are the axes of the camera in the world; y is down.
     up = -viewmats[:, 1, :3].mean(axis=0)
