@@ -217,7 +217,7 @@ def test_a_file_with_other_shared_numbers_is_refused(tmp_path):
     network = {**model.appearance.network, "weights": jnp.zeros((9, 7))}
     other = dataclasses.replace(model.appearance, network=network)
     a2tg.save_model(tmp_path / "model.npz", dataclasses.replace(model, appearance=other))
-    with pytest.raises(ValueError, match=r"network\['weights'\] must be \[8, 7\], .*got \[9, 7\]"):
+    with pytest.raises(ValueError, match=r"network\['weights'\] must be \[8, 7\]; got \[9, 7\]"):
         a2tg.load_model(tmp_path / "model.npz", appearances=(Painted,))
 
 

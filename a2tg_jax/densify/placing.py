@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from a2tg_jax.appearance import allocate_appearance
 from a2tg_jax.base.checks import check_number
+from a2tg_jax.base.even_spacing import evenly_chosen
 from a2tg_jax.core.cameras import back_project
 from a2tg_jax.core.gaussians import Gaussians, no_rows, sh_of_colors
-from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.origin import Color
 from a2tg_jax.core.pytree import pytree, static

@@ -36,9 +36,9 @@ from a2tg_jax import (
     fit_stage,
 )
 from a2tg_jax.appearance.parts import MAX_DEGREE, nearest_gaussians
+from a2tg_jax.base.even_spacing import evenly_chosen
 from a2tg_jax.core.budget import bytes_per_gaussian
 from a2tg_jax.core.gaussians import logit
-from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.origin import Color
 from a2tg_jax.core.sh import NUM_BASES, SH_C0
 from a2tg_jax.data.assembly import scene_scale

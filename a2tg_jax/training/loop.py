@@ -14,10 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from a2tg_jax.base.even_spacing import evenly_chosen
 from a2tg_jax.base.machine import Devices
 from a2tg_jax.base.text import in_bytes
 from a2tg_jax.core.compilations import compilations
-from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.table import Layout
 from a2tg_jax.events import Due, HostEvent, StepEvent
 from a2tg_jax.model import Model
