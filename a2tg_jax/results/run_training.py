@@ -26,7 +26,7 @@ from a2tg_jax.host.errors import error_text
 from a2tg_jax.host.training_bar import ProgressBar
 from a2tg_jax.io.formats import load_splats
 from a2tg_jax.model_file import number_in_file
-from a2tg_jax.results.commands import file_command, resuming_command
+from a2tg_jax.results.commands import file_command, resuming_command, viewing_command
 from a2tg_jax.results.compression import SUFFIX, compress
 from a2tg_jax.results.folder import RunFolder, check_free, claimed, iteration_of, put_back_old, set_aside
 from a2tg_jax.results.forecast import checked_forecast, doubts_about, room_for_photographs, time_after
@@ -175,15 +175,14 @@ def _advice(run: RunFolder, options: RunOptions) -> str:
 
 
 def how_to_go_on(run: RunFolder, devices: Devices | None = None) -> str:
-    """Return the path of the newest checkpoint, or else model, and the command that resumes, as `resuming_command`."""
-    names = read_record(run).plan.names
+    """Return the newest file of the training and the command that shows it, and the command that resumes, as
+    `resuming_command`."""
     kept = "there is no checkpoint yet"
-    for name in names:
-        if run.model(name).is_file():
-            kept = f"the last model is {run.model(name)}"
-    for name in names:
-        for path in run.checkpoints(name):
-            kept = f"the last checkpoint is {path}"
+    for name in read_record(run).plan.names:
+        path = run.newest(name)
+        if path is not None:
+            what = "model" if path == run.model(name) else "checkpoint"
+            kept = f"the last {what} is {path}; show it with: {viewing_command(run, name)}"
     return f"{kept}; continue with: {resuming_command(run, devices)}"
 
 

@@ -24,8 +24,8 @@ from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import combine, partition
 from a2tg_jax.core.table import map_rows
 from a2tg_jax.model import Model, check_model
-from a2tg_jax.scene import View
-from a2tg_jax.training.corrections import check_corrections
+from a2tg_jax.scene import Scene, View
+from a2tg_jax.training.corrections import check_corrections, corrected_origin
 from a2tg_jax.training.history import COLUMNS, History, check_history
 from a2tg_jax.training.options import System
 from a2tg_jax.training.recorded_views import RecordedViews
@@ -72,6 +72,12 @@ class Checkpoint(NamedFields):
     def model(self) -> Model:
         """The Gaussians that exist, and what they show."""
         return self.state.model.live
+
+    def model_in(self, scene: Scene) -> Model:
+        """Return the model as of a finished stage: with the scene's cameras, as corrected so far, and a background."""
+        corrections = self.system.all_stages()[self.stage].corrections
+        origin = corrected_origin(scene.origin, corrections, self.state.corrections)
+        return dataclasses.replace(self.model, background=self.system.background_color, origin=origin)
 
     def __repr__(self) -> str:
         at = f"stage {self.stage + 1}"
