@@ -298,7 +298,7 @@ def test_weights_for_pruning_are_those_of_plain_splats():
     scene = a2tg.synthetic_scene(num_views=3, width=16, height=16, num_points=50)
     model = some_model()
     plain = dataclasses.replace(model, appearance=a2tg.Appearance())
-    found, wanted = (shown_in(each, scene.train).weights for each in (with_gain(model, -3.0), plain))
+    found, wanted = (shown_in(each, a2tg.Due(views=scene.train)).weights for each in (with_gain(model, -3.0), plain))
     assert wanted.max() > 1
     np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-6)
 

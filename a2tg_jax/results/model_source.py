@@ -34,7 +34,6 @@ from a2tg_jax.results.folder import RunFolder, iteration_of, open_run, runs_in
 from a2tg_jax.results.history import write_history
 from a2tg_jax.results.plan import PlannedStage, RunPlan
 from a2tg_jax.results.record import RunRecord, read_record
-from a2tg_jax.training.stage import BACKGROUNDS
 from a2tg_jax.training.start import left_out, new_appearance, with_degree
 
 READABLE = [suffix for suffix, format in FORMATS.items() if format.load is not None]
@@ -262,7 +261,7 @@ def write_first_stage(run: RunFolder, record: RunRecord, splats: Model, scene: S
     appearance = new_appearance(template, gaussians, system)
     if shapes is not None:
         appearance = appearance.with_shapes(shapes)
-    model = Model(gaussians, appearance, background=BACKGROUNDS[system.background], origin=scene.origin)
+    model = Model(gaussians, appearance, background=system.background_color, origin=scene.origin)
     # No system in the header: none trained it, so that resuming has no options to compare.
     save_model(run.own(run.model(planned.name)), model, {"init": record.init})
     write_history(run.own(run.history(planned.name)), History.empty())

@@ -19,6 +19,7 @@ from a2tg_jax import (
     Evaluation,
     History,
     Model,
+    Origin,
     Renderer,
     Scene,
     System,
@@ -54,10 +55,11 @@ from a2tg_jax.results.plan import PlannedStage, RunPlan
 from a2tg_jax.results.record import is_finished, read_record
 from a2tg_jax.results.report import Comparison, ModelResult, RunResult, metrics_json, per_view_json, write_report
 from a2tg_jax.results.stage_training import check_held_out
-from a2tg_jax.training.corrections import learned
 from a2tg_jax.web.page import viewer_html_with
 
 REPORTED_VIEWS = 4
+MOST_READABLE = 100
+"""Largest number of numbers of a correction in corrections.json."""
 
 
 def evaluate_run(run: RunFolder, scene: Scene | None = None, *, lpips_weights: Path | None = None) -> RunResult:
@@ -96,7 +98,7 @@ def evaluate_run(run: RunFolder, scene: Scene | None = None, *, lpips_weights: P
     write_json(run.own(run.per_view), per_view_json(result))
     for name, model in models.items():
         if model.origin is not None and model.origin.corrections:  # exposure [3, 4] = [A | b] and pose [6] by view
-            write_json(run.own(run.corrections(name)), learned(model.origin))
+            write_json(run.own(run.corrections(name)), learned_corrections(model.origin))
     main = models[result.main]
     save_ply(run.own(run.point_cloud), main, world="upright")
     # Browsers cannot show subclasses of Appearance.
@@ -243,3 +245,16 @@ def _write_sheets(run: RunFolder, result: RunResult, models: Mapping[str, Model]
             crop = largest_gain(photograph, renders[0], renders[-1]) if len(renders) > 1 else None
             reported.append(Comparison.of(view.name, images, captions, crop))
     return reported
+
+
+def learned_corrections(origin: Origin) -> Mapping[str, Mapping[str, list[float]]]:
+    """Return the corrections of each training photograph, as lists of numbers: name → correction → row.
+
+    Rows of more than `MOST_READABLE` numbers are left out.
+    """
+    readable = {name: rows for name, rows in origin.corrections.items() if rows[0].size <= MOST_READABLE}
+    by_photograph = {}
+    for index, name in enumerate(origin.names):
+        if not origin.is_test[index]:
+            by_photograph[name] = {correction: rows[index].tolist() for correction, rows in readable.items()}
+    return by_photograph
