@@ -30,7 +30,8 @@ READERS = pathlib.Path(__file__).resolve().parents[1] / "docs" / "reference"
 
 
 LONGEST = {
-    "test_bytewise", "test_devices", "test_experiments", "test_processes", "test_systems", "test_viewer_browser",
+    "test_bytewise", "test_devices", "test_experiments", "test_processes", "test_systems", "test_training",
+    "test_viewer_browser",
 }  # fmt: skip
 """Files that come first, so that no process is left with one of them while the others have nothing to do."""
 MOST_BYTES = 2.5e9

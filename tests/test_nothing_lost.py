@@ -25,6 +25,7 @@ from a2tg_jax import (
     Change,
     DivergedError,
     Gaussians2dMcmc,
+    LossConfig,
     Mcmc,
     StepEvent,
     fit,
@@ -46,14 +47,14 @@ from a2tg_jax.results.run_training import RunOptions, train_run
 from a2tg_jax.training.batches import BatchOrder
 from a2tg_jax.training.loop import StageRun
 
-SIZES = {"initial_gaussians": 60, "densify": Mcmc(cap=60)}
+SIZES = {"initial_gaussians": 60, "densify": Mcmc(cap=60), "loss": LossConfig(ssim_weight=0.0)}
 SOURCE = SceneSource("synthetic", downscale=6)
 RECORD = RunRecord(SOURCE, "gaussians-2d-mcmc", Gaussians2dMcmc(stage1_iterations=20, **SIZES))
 NAME = "gaussians-2d-mcmc-gaussians"
 QUIET = RunOptions(progress=False)
 TRAIN = [
     *("train", "synthetic", "--system", "gaussians-2d-mcmc", "--downscale", "6", "--stage1-iterations", "20"),
-    *("--initial-gaussians", "60", "--densify.cap", "60"),
+    *("--initial-gaussians", "60", "--densify.cap", "60", "--loss.ssim-weight", "0"),
 ]
 
 
