@@ -20,7 +20,15 @@ from numpy.typing import ArrayLike
 
 from a2tg_jax.appearance import Appearance, Texture, check_is_appearance
 from a2tg_jax.appearance.base import num_colors_of
-from a2tg_jax.base.checks import check_floats, check_kind, check_shape, check_unmasked, dtype_of, plain_array
+from a2tg_jax.base.checks import (
+    check_count,
+    check_floats,
+    check_kind,
+    check_shape,
+    check_unmasked,
+    dtype_of,
+    plain_array,
+)
 from a2tg_jax.core.cameras import Camera, check_camera
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
@@ -112,11 +120,7 @@ def render_appearance(
     background = (0,) * num_colors if background is None else background
     background = background_array(background, gaussians, num_colors)
     if num_live is not None:
-        check_shape("num_live", num_live, ())
-        is_known = not isinstance(num_live, jax.core.Tracer)
-        num = gaussians.num
-        if not jnp.issubdtype(dtype_of(num_live), jnp.integer) or (is_known and not 0 <= int(num_live) <= num):
-            raise ValueError(f"num_live must be an integer, 0 to {num}; got {num_live}")
+        check_count("num_live", num_live, gaussians.num)
     planned = with_capacity(settings, gaussians, camera, appearance, num_live)
     output, num_pairs = jitted_render()(gaussians, camera, appearance, background, planned, num_live=num_live)
     # A capacity planned here suffices; one from the caller may not. Under jit and vmap there is nothing to read.

@@ -63,24 +63,31 @@ def plan_render(
         raise ValueError("cameras must be one camera at least; got none")
     check_number("head_room", head_room, least=1)
     check_kind("settings", settings, RenderSettings)
-    num_live = None
-    if isinstance(gaussians, Model):
-        if appearance is not None or textures is not None:
-            raise ValueError("a model has an appearance already: use plan_render(model, cameras)")
-        model = gaussians
-        gaussians = gaussians.gaussians
-        appearance = model.appearance
-        num_live = model.num_live
-    check_gaussians(gaussians)
-    if appearance is None:
-        appearance = appearance_of(gaussians, textures, settings)
-    elif textures is not None:
-        raise ValueError("give an appearance or textures, not both")
-    check_is_appearance(appearance, gaussians)
-    most = most_pairs(gaussians, cameras, appearance, settings, num_live)
-    if most == 0 and has_rows(gaussians, num_live):
+    model = _model_of(gaussians, appearance, textures, settings)
+    most = most_pairs(model.gaussians, cameras, model.appearance, settings, model.num_live)
+    if most == 0 and has_rows(model.gaussians, model.num_live):
         warn_of_empty("any of the cameras", stacklevel=3)
     return dataclasses.replace(settings, capacity=TileRoom().plan(None, most, head_room))
+
+
+def _model_of(
+    gaussians: Model | Gaussians, appearance: Appearance | None, textures: Textures | None, settings: RenderSettings
+) -> Model:
+    """Return a model itself, or one of Gaussians with an appearance or textures. ValueError: more is given, or they do
+    not fit."""
+    if isinstance(gaussians, Model):
+        if appearance is not None or textures is not None:
+            raise ValueError("appearance: a model has its own; give the model alone, or Gaussians")
+        model = gaussians
+    elif appearance is not None and textures is not None:
+        raise ValueError("give an appearance or textures, not both")
+    else:
+        check_gaussians(gaussians)
+        appearance = appearance_of(gaussians, textures, settings) if appearance is None else appearance
+        model = Model(gaussians, appearance)
+    check_gaussians(model.gaussians)
+    check_is_appearance(model.appearance, model.gaussians)
+    return model
 
 
 class Renderer:
@@ -125,14 +132,7 @@ class Renderer:
         """
         check_kind("model", model, (Model, Gaussians))
         check_kind("settings", settings, RenderSettings)
-        if appearance is not None:
-            check_is_appearance(appearance)
-        if isinstance(model, Model) and appearance is not None:
-            raise ValueError("appearance: a model has its own; give Gaussians with an appearance")
-        if not isinstance(model, Model):
-            model = Model(model, appearance or appearance_of(model, None, settings))
-        check_gaussians(model.gaussians)
-        check_is_appearance(model.appearance, model.gaussians)
+        model = _model_of(model, appearance, None, settings)
         background = model.default_background if background is None else background
         self._gaussians = model.gaussians
         self._num_live = model.num_live

@@ -1,5 +1,6 @@
 """The registered comparison of `bytewise`: its endpoints, and exploration (E6 of PROTOCOL.md)."""
 
+import collections
 import dataclasses
 from collections.abc import Mapping, Sequence
 
@@ -44,11 +45,14 @@ SECONDARY = (
 )
 
 
-def endpoints_table(results: Sequence[Result], confirmation: Sequence[Result]) -> str:
+def endpoints_table(
+    results: Sequence[Result], confirmation: Sequence[Result], num_pairs: Mapping[float | None, int]
+) -> str:
     """Return the table of the endpoints; p-values of the secondary ones are corrected together.
 
     Args:
       results: runs of dense captures.
+      num_pairs: number of pairs of runs that an endpoint has when all are finished, by budget.
       confirmation: runs of captures that nothing was tuned on, each of which has a column.
     """
     found = {one: compare(row_of(results, one.budget, one.other).differences(one.figure)) for one in registered()}
@@ -61,10 +65,14 @@ def endpoints_table(results: Sequence[Result], confirmation: Sequence[Result]) -
             continue
         p_value = corrected.get(one, found[one].p_value)
         role = "primary" if one == PRIMARY else "secondary"
+        num = sum(map(len, row_of(results, one.budget, one.other).differences(one.figure).values()))
+        all_pairs = num_pairs[one.budget]
+        is_whole = num == all_pairs
+        outcome = decision(found[one], p_value) if is_whole else f"unfinished, {num} of {all_pairs} pairs"
         unseen = compare(row_of(confirmation, one.budget, one.other).differences(one.figure)).by_scene
         shown = [tables.signed(unseen.get(name, float("nan")), tables.DIGITS[one.figure]) for name in captures]
         texts = endpoint_texts(one, found[one])
-        lines.append([role, *texts, tables.number(p_value, 3), decision(found[one], p_value), *shown])
+        lines.append([role, *texts, tables.number(p_value, 3), outcome, *shown])
     return table(["", "`bytewise` −", "", "mean over captures", "won", "p", "", *captures], lines)
 
 
@@ -155,7 +163,9 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     )
     rows = [row_of(dense, budget, other) for budget in BUDGETS for other in OTHERS]
     rows += [row_of(few, budget, other, "few views") for budget in BUDGETS for other in OTHERS]
-    lab.write(EXPERIMENT.name, f"# {grid.title}\n\n{endpoints_table(dense, unseen)}\n{times_text(dense, lab.records)}")
+    num_pairs = collections.Counter(cell.budget for cell in grid.cells if cell.scene.fold is None)
+    endpoints = endpoints_table(dense, unseen, num_pairs)
+    lab.write(EXPERIMENT.name, f"# {grid.title}\n\n{endpoints}\n{times_text(dense, lab.records)}")
     lab.write("exploration", f"# All comparisons\n\n{exploration_table(rows)}\n{scenes_table(results, list(OTHERS))}")
 
 

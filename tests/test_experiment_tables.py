@@ -320,13 +320,15 @@ def test_registered_endpoints_are_decided_by_interval_and_corrected_p_value():
         claims_result("alexander", claims.BYTEWISE, 30.0),
         claims_result("alexander", claims.STRONGEST, 30.5, equal="time"),
     ]
-    rows = [line.split(" | ") for line in claims.endpoints_table(results, unseen).splitlines()]
+    rows = [line.split(" | ") for line in claims.endpoints_table(results, unseen, {0.3: 9}).splitlines()]
     assert rows[0][-1] == "alexander |"
     primary, iterations, lpips = rows[2:]
     # 2 of 2^9 sign flips are as far from 0; the smaller of two secondary p-values counts twice.
     assert primary[:1] + primary[3:] == ["| primary", "+1.40 ± 0.21", "9/9", ".004", "**decided**", "-0.50 |"]
     assert iterations[:1] + iterations[3:] == ["| secondary", "+0.60 ± 0.21", "9/9", ".008", "**decided**", "– |"]
     assert lpips[3:] == ["+0.000 ± 0.000", "0/9", "1.000", "undecided", "+0.000 |"]
+    unfinished = claims.endpoints_table(results, unseen, {0.3: 18}).splitlines()[2:]
+    assert all("| unfinished, 9 of 18 pairs |" in line for line in unfinished)
 
 
 def test_equal_time_is_the_time_of_all_stages():

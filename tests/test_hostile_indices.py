@@ -218,7 +218,7 @@ def test_rows_of_regions_and_of_models_are_counted():
     with pytest.raises(ValueError, match=r"regions\.first \[N\] of N = 50 gaussians; Short gave \(9,\)"):
         a2tg.render_appearance(GAUSSIANS, CAMERA, Short(texture=Texture(TEXTURES)))
     for num_live in (-1, NUM + 1, 2.5):
-        with pytest.raises(ValueError, match=f"num_live must be an integer, 0 to {NUM}; got {num_live}"):
+        with pytest.raises(ValueError, match=rf"num_live must be a whole number in 0\.\.{NUM}; got {num_live}"):
             a2tg.Model(GAUSSIANS, num_live=num_live).render(CAMERA)
 
 

@@ -131,7 +131,7 @@ def test_models_that_no_camera_sees(tmp_path, change, message):
     [
         (with_number("appearance/shapes", np.nan), "must be finite"),
         (with_number("appearance/shapes", 1e30), "must be within"),
-        (with_array("appearance/shapes", lambda x: x[1:]), r"shapes must be \[12\], one for each Gaussian"),
+        (with_array("appearance/shapes", lambda x: x[1:]), r"shapes must be \[12\]; got \[11\]"),
         (with_array("appearance/shapes", lambda x: x[:, None]), r"shapes must be floats \[N\]"),
         (with_array("appearance/shapes", lambda x: x.astype(int)), r"shapes must be floats \[N\]"),
         (lambda _, arrays: arrays.pop("appearance/shapes"), "the array shapes of the appearance is missing"),

@@ -1,4 +1,6 @@
-"""What splats show: `base` is the interface, `parts` are its optional parts: texture, exponents, bands.
+"""Appearance of splats: `base` is the interface, `parts` are its optional parts: texture, exponents, bands.
+
+`shapes` are always shapes of kernels, numbers from which their exponents follow; arrays have sizes.
 
 `movable_kernels` and `billboards` are other appearances. Compositors trace `elementwise`; `files` names the arrays in
 files.

@@ -40,7 +40,7 @@ from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians, logit, share
-from a2tg_jax.core.geometry import homographies
+from a2tg_jax.core.geometry import homographies_of
 from a2tg_jax.core.numerics import Integer, at_least
 from a2tg_jax.core.pytree import is_shared, partition, pytree, static
 from a2tg_jax.core.sh import sh_sum
@@ -110,7 +110,7 @@ class Appearance(NamedFields):
 
         M[:, 2, 2] is the depth by which splats are sorted.
         """
-        return homographies(gaussians, camera)
+        return homographies_of(gaussians, camera)
 
     def peak_opacities(self, gaussians: Gaussians) -> Array:
         """Return the peak opacities [N], before falloff and alpha factor."""
@@ -121,8 +121,9 @@ class Appearance(NamedFields):
 
         By default, D = 3 of spherical harmonics up to `degree`, which may be traced.
         """
+        sums = color_sums(self, gaussians, camera, degree)
         # Not `jnp.maximum`, which halves the gradient of colours at exactly 0.
-        return at_least(color_sums(self, gaussians, camera, degree) + 0.5, 0.0)
+        return at_least(sums + 0.5, 0.0)
 
     def atlas(self) -> tuple[Array, TextureRegion | None]:
         """Return the texels [T, C] of all splats, T >= 1, and the N places of the splats' textures among them; None
@@ -323,9 +324,10 @@ def gaussian_cutoff(peak: Array) -> Array:
 
 def color_sums(appearance: Appearance, gaussians: Gaussians, camera: Camera, degree: Integer) -> Array:
     """Return the sums of spherical harmonics [N, 3], from which 0.5 leads to colours; linear in the coefficients."""
-    sums = sh_sum(gaussians.sh, gaussians.means, camera.center, degree)
     bands = appearance.bands
-    return sums if bands is None else sums + bands.color_sums(gaussians, camera.center, degree)
+    above = None if bands is None else bands.color_sums(gaussians, camera.center, degree)
+    sums = sh_sum(gaussians.sh, gaussians.means, camera.center, degree)
+    return sums if above is None else sums + above
 
 
 def colors_in_view(appearance: Appearance, gaussians: Gaussians, camera: Camera, degree: Integer) -> Array:

@@ -23,8 +23,8 @@ from a2tg_jax.core.pytree import check_pytree
 from a2tg_jax.core.table import check_table, is_table
 from a2tg_jax.texture import NEUTRAL_TEXEL
 
-ODD_SHAPE = (5, 7)
-"""Odd shape of test arrays, which no matrix in an appearance fits by chance."""
+ODD_SIZES = (5, 7)
+"""Odd sizes of test arrays, which no matrix in an appearance fits by chance."""
 CURVE = len(Curve._fields)
 
 
@@ -206,7 +206,7 @@ def check_shading(static: StaticShading, arguments: Arguments) -> None:
 
 
 def _sizes(values: object) -> tuple[tuple[int, ...], ...] | None:
-    """Return the shapes of several numbers, or of the entries of an array of them; None for anything else."""
+    """Return the sizes of several arrays, or of the entries of one; None for anything else."""
     if hasattr(values, "shape"):
         return (tuple(values.shape[1:]),) * values.shape[0] if values.shape else None
     if not isinstance(values, tuple | list) or not all(hasattr(value, "shape") for value in values):
@@ -220,13 +220,13 @@ def takes_arrays(static: StaticShading, arguments: Arguments) -> bool:
 
     A matrix product in `shade` takes scalars only: with arrays of pixels it would contract the pixels.
     """
-    shapes = ODD_SHAPE, (arguments.num_colors, *ODD_SHAPE)
-    for name, arrays in arguments.of(ODD_SHAPE).items():
+    wanted = ODD_SIZES, (arguments.num_colors, *ODD_SIZES)
+    for name, arrays in arguments.of(ODD_SIZES).items():
         try:
             results = jax.make_jaxpr(getattr(static.functions, name))(*arrays).jaxpr.outvars
         except Exception:  # Any error of the user's code: it has passed with scalars, so it cannot take arrays.
             return False
-        if not all(isinstance(x, jax.extend.core.Literal) or x.aval.shape in shapes for x in results):
+        if not all(isinstance(x, jax.extend.core.Literal) or x.aval.shape in wanted for x in results):
             return False
     return True
 

@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike, DTypeLike
 
-from a2tg_jax.base.checks import check_literals, check_number
+from a2tg_jax.base.checks import check_literals, check_number, check_shape
 from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.gaussians import LARGEST_OPACITY, Gaussians, logit
@@ -279,9 +279,7 @@ class Exponents(Part):
         return dataclasses.replace(self, shapes=jnp.zeros(gaussians.num, gaussians.means.dtype))
 
     def check(self, gaussians: Gaussians) -> None:
-        if self.shapes is None or self.shapes.shape != (gaussians.num,):
-            shape = None if self.shapes is None else list(self.shapes.shape)
-            raise ValueError(f"shapes must be [{gaussians.num}], one for each Gaussian; got {shape}")
+        check_shape("shapes", self.shapes, (gaussians.num,))
 
 
 class Curve(NamedTuple):

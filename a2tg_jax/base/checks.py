@@ -283,11 +283,11 @@ def _float_rows(name: str, tree: object) -> Iterator[tuple[str, np.ndarray]]:
             yield f"{name}{jax.tree_util.keystr(path)}", values.reshape(len(values), math.prod(values.shape[1:]))
 
 
-def check_count(name: str, value: object, most: int) -> None:
-    """Raise ValueError unless a value is one integer in 0..most."""
-    number = np.asarray(value)
-    if number.shape or number.dtype.kind not in "iu" or not 0 <= int(number) <= most:
-        raise ValueError(f"{name} must be a whole number in 0..{most}; got {shortened(repr(value))}")
+def check_count(name: str, value: Any, most: int) -> None:
+    """Raise ValueError unless a value is one integer in 0..most. Values of tracers are not read."""
+    is_integer = np.shape(value) == () and jnp.issubdtype(dtype_of(value), jnp.integer)
+    if not is_integer or not (isinstance(value, jax.core.Tracer) or 0 <= int(value) <= most):
+        raise ValueError(f"{name} must be a whole number in 0..{most}; got {shortened(str(value))}")
 
 
 def check_like(name: str, tree: object, wanted: object) -> None:

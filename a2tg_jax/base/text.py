@@ -92,9 +92,5 @@ def in_bytes(num: float) -> str:
 
 
 def _three_digits(number: float) -> str:
-    # Numbers are rounded up to 10.0 from 9.995 on, and to 100 from 99.95 on.
-    if number < 9.995:
-        return f"{number:.2f}"
-    if number < 99.95:
-        return f"{number:.1f}"
-    return f"{number:,.0f}"
+    # Numbers are rounded up to 100 from 99.95 on.
+    return f"{number:#.3g}" if number < 99.95 else f"{number:,.0f}"

@@ -144,7 +144,7 @@ class Render:
         defaulting_to("1280x720, or 720x1280 if the photographs are upright"),
     ] = None
     """Width and height of the frames in pixels, such as 1920x1080; test views keep theirs by default. Views of another
-    aspect are cropped."""
+    aspect are cropped, but a turntable shows them whole, with more at two sides."""
     supersample: int = 1
     """Factor k by which frames are drawn larger and averaged: without aliasing where frames are smaller than the
     photographs, at k² times the cost."""

@@ -144,7 +144,8 @@ def check_calibration(viewmat: np.ndarray, K: np.ndarray, width: int, height: in
     rotation = viewmat[:3, :3]
     if not (np.abs(viewmat) <= LARGEST_COORDINATE).all():  # False for NaN.
         raise ValueError(f"{what}: its pose must be finite, within ±{LARGEST_COORDINATE:g}; got {_numbers(viewmat)}")
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > MAX_SKEW or not np.array_equal(viewmat[3], [0, 0, 0, 1]):
+    is_rotation = np.abs(rotation @ rotation.T - np.eye(3)).max() <= MAX_SKEW and np.linalg.det(rotation) > 0
+    if not is_rotation or not np.array_equal(viewmat[3], [0, 0, 0, 1]):
         raise ValueError(f"{what}: its pose must be a rigid motion; got {_numbers(viewmat)}")
 
 

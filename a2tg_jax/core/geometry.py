@@ -46,7 +46,7 @@ def pixel_sizes(means: Floats, scales: Floats, viewmat: Floats, K: Floats) -> Fl
     return (depths > NEAR_PLANE).astype(depths.dtype) * scales.min(axis=1) * focal / depths.clip(NEAR_PLANE)
 
 
-def homographies(gaussians: Gaussians, camera: Camera) -> tuple[Array, Array]:
+def homographies_of(gaussians: Gaussians, camera: Camera) -> tuple[Array, Array]:
     """Return M [N, 3, 3] and normals [N, 3] in the world, turned to face the camera."""
     # Number by number: CPUs vectorise over N, but not over axes of 2 and 3.
     x_axis, y_axis, normal = rotation_columns(tuple(gaussians.quats[:, k] for k in range(4)))

@@ -90,17 +90,16 @@ class Origin(NamedFields):
     @property
     def training_cameras(self) -> list[Camera]:
         """Cameras of photographs that were trained on; all cameras if all were held out."""
-        trains_on_all = bool(self.is_test.all())
-        cameras = zip(self.cameras, self.is_test, strict=True)
-        return [camera for camera, is_test in cameras if trains_on_all or not is_test]
+        return self.cameras if self.is_test.all() else self._cameras_where(~self.is_test)
 
     @property
     def held_out_cameras(self) -> list[Camera]:
         """Cameras of photographs that were held out for testing; empty if all were, which then count as training
         cameras."""
-        if self.is_test.all():
-            return []
-        return [camera for camera, is_test in zip(self.cameras, self.is_test, strict=True) if is_test]
+        return [] if self.is_test.all() else self._cameras_where(self.is_test)
+
+    def _cameras_where(self, is_chosen: np.ndarray) -> list[Camera]:
+        return [camera for camera, is_one in zip(self.cameras, is_chosen, strict=True) if is_one]
 
     def moved(self, similarity: Similarity) -> "Origin":
         """Return the same cameras in the world that `similarity` leads to, without the corrections they contain."""

@@ -22,7 +22,7 @@ from a2tg_jax.data.assembly import (
     rigid_viewmat,
     warn_of_rounding,
 )
-from a2tg_jax.data.capture_geometry import camera_centers, nearest_point
+from a2tg_jax.data.capture_geometry import camera_centers, subject_of
 from a2tg_jax.data.photo_points import MOST_VIEWS, Look, agreement
 
 OFF_CENTER = 1.25
@@ -214,7 +214,7 @@ def _agree_on_subject(shots: Sequence[Shot], viewmats: np.ndarray) -> bool:
     viewmats = evenly_chosen(viewmats, MOST_VIEWS)
     looks = [Look(shot.picture, shot.mask, viewmat, shot.K) for shot, viewmat in zip(shots, viewmats, strict=True)]
     centers = camera_centers(viewmats)
-    subject = nearest_point(centers, viewmats[:, 2, :3])
+    subject = subject_of(viewmats)
     half_side = SUBJECT * np.median(np.linalg.norm(centers - subject, axis=1))
     points = subject + half_side * np.random.default_rng(0).uniform(-1, 1, (NUM_TRIED, 3))
     difference = agreement(looks, points)
@@ -234,9 +234,8 @@ def _share_seen(shots: Sequence[Shot], viewmats: np.ndarray, points: np.ndarray)
 
 def _share_that_meet(viewmats: np.ndarray, precision: float) -> float:
     """Return the share of cameras that look at the point nearest to all axes, to `precision` times its distance."""
-    centers = camera_centers(viewmats)
     axes = viewmats[:, 2, :3]
-    offsets = nearest_point(centers, axes) - centers
+    offsets = subject_of(viewmats) - camera_centers(viewmats)
     depths = np.sum(offsets * axes, axis=1)
     # The axes are unit vectors, so |offset × axis| is the distance from the point to the axis.
     distances = np.linalg.norm(np.cross(offsets, axes), axis=1)

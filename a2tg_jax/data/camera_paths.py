@@ -12,10 +12,10 @@ from a2tg_jax import Camera, Origin, resize_camera
 from a2tg_jax.base.checks import check_int
 from a2tg_jax.core.cameras import check_camera, checked_cameras
 from a2tg_jax.data.capture_geometry import (
-    LEAST_FACING,
     camera_centers,
+    distance_to_subject,
     matrices_of,
-    nearest_point,
+    subject_of,
     without_outlying,
 )
 
@@ -48,14 +48,12 @@ def turntable(cameras: Sequence[Camera], num_frames: int, up: ArrayLike | None =
     if not cameras:
         raise ValueError("an orbit needs a camera; got none")
     viewmats = matrices_of(cameras)
-    centers = camera_centers(viewmats)
-    axes = viewmats[:, 2, :3]
-    subject = nearest_point(centers, axes)
-    up = Origin.of_cameras(cameras).vertical if up is None else np.asarray(up)
-    offsets = centers - subject
-    distances = np.maximum(np.linalg.norm(offsets, axis=1), 1e-12)
-    if np.median(-np.sum(offsets * axes, axis=1) / distances) < LEAST_FACING:
+    if np.isnan(distance_to_subject(viewmats)):
         raise ValueError("cameras must look at one subject to orbit, and these do not: use smooth_path")
+    subject = subject_of(viewmats)
+    up = Origin.of_cameras(cameras).vertical if up is None else np.asarray(up)
+    offsets = camera_centers(viewmats) - subject
+    distances = np.maximum(np.linalg.norm(offsets, axis=1), 1e-12)
     elevation = np.arcsin(np.clip(offsets @ up / distances, -1, 1)).mean()
     elevation = np.clip(elevation, -LARGEST_ELEVATION, LARGEST_ELEVATION)
     # The unit direction of the first offset perpendicular to the vertical; any such one if the offset is vertical.

@@ -29,8 +29,11 @@ def camera_centers(viewmats: np.ndarray) -> np.ndarray:
     return -centers
 
 
-def nearest_point(centers: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """Return argmin_x Σ |(I - d·dᵀ)(x - c)|² for lines through `centers` along unit `axes`, or the mean centre."""
+def subject_of(viewmats: np.ndarray) -> np.ndarray:
+    """Return the point [3] nearest to the optical axes of cameras [V, 4, 4], argmin_x Σ |(I - d·dᵀ)(x - c)|², or the
+    mean centre if the axes are about parallel."""
+    centers = camera_centers(viewmats)
+    axes = viewmats[:, 2, :3]
     # Normal equations of the least squares: Σ P·x = Σ P·c with P = I − d·dᵀ.
     projections = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     normal_matrix = projections.mean(axis=0)
@@ -42,11 +45,9 @@ def nearest_point(centers: np.ndarray, axes: np.ndarray) -> np.ndarray:
 def distance_to_subject(viewmats: np.ndarray) -> float:
     """Return the median distance of cameras [V, 4, 4] from the point nearest to their optical axes; NaN if most do not
     look there, such as along a street."""
-    centers = camera_centers(viewmats)
-    axes = viewmats[:, 2, :3]
-    offsets = nearest_point(centers, axes) - centers
+    offsets = subject_of(viewmats) - camera_centers(viewmats)
     distances = np.linalg.norm(offsets, axis=1)
-    facing = np.sum(offsets * axes, axis=1) / np.maximum(distances, 1e-12)
+    facing = np.sum(offsets * viewmats[:, 2, :3], axis=1) / np.maximum(distances, 1e-12)
     return float(np.median(distances)) if np.median(facing) >= LEAST_FACING else np.nan
 
 
@@ -103,9 +104,7 @@ def central_camera(viewmats: np.ndarray) -> int:
     """Return the index of the camera [V, 4, 4] whose axis passes nearest to the subject and which is nearest to the
     median camera, with equal weight."""
     centers = camera_centers(viewmats)
-    axes = viewmats[:, 2, :3]
-    subject = nearest_point(centers, axes)
-    misses = np.linalg.norm(np.cross(subject - centers, axes), axis=1)
+    misses = np.linalg.norm(np.cross(subject_of(viewmats) - centers, viewmats[:, 2, :3]), axis=1)
     remote = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
     return int(np.argmin(misses + remote))
 

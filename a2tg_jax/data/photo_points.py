@@ -13,9 +13,8 @@ import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.spatial import cKDTree
 
-from a2tg_jax import Mask, Picture
+from a2tg_jax import Mask, Picture, RenderSettings
 from a2tg_jax.core.cameras import pinhole_pixels
-from a2tg_jax.core.geometry import NEAR_PLANE
 
 # Chosen in experiments/NOTEBOOK.md, "A start from photographs".
 MOST_VIEWS = 32
@@ -86,7 +85,7 @@ class Look:
         with np.errstate(divide="ignore", invalid="ignore"):
             x, y = pinhole_pixels(in_frame, self.K).T
         height, width = self.size
-        is_in = (in_frame[:, 2] > NEAR_PLANE) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        is_in = (in_frame[:, 2] > RenderSettings.near_plane) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
         column = np.where(is_in, x, 0).astype(int)
         row = np.where(is_in, y, 0).astype(int)
         pixel = row // self.factor, column // self.factor

@@ -22,7 +22,6 @@ from numpy.typing import ArrayLike
 from a2tg_jax import Camera, Gaussians, Model, RenderSettings, Textures, View, plan_render
 from a2tg_jax.core.origin import Color
 from a2tg_jax.core.sh import SH_C0
-from a2tg_jax.core.table import Group
 from a2tg_jax.finish.compaction import loss_on_views
 from a2tg_jax.model import check_is_model
 from a2tg_jax.rasterize.views import render_traced
@@ -36,6 +35,8 @@ LEAST_SAVED = 0.005
 """Smallest share of a model's bytes that a round must save for another one."""
 LEAST_WEIGHT = 1e-9
 """Visibility of texels that no view shows; it keeps means finite."""
+Group = tuple[np.ndarray, np.ndarray]
+"""Indices [n] of Gaussians and their textures [n, Tv, Tu, C], as of `Textures.groups`."""
 
 
 def shrink_textures(

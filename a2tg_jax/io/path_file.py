@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from a2tg_jax import Camera
 from a2tg_jax.base.json_text import number_array
 from a2tg_jax.base.text import shortened
-from a2tg_jax.core.cameras import check_calibration, check_camera
+from a2tg_jax.core.cameras import check_calibration
 from a2tg_jax.io.saved_file import load_saved
 
 # A file may come from a stranger: sides decide how much memory a frame takes.
@@ -38,6 +38,4 @@ def _camera(view: object, where: str) -> Camera:
     if not all(1 <= side <= LARGEST_SIDE and side == int(side) for side in (width, height)):
         raise ValueError(f"{where}.size must be 1 to {LARGEST_SIDE} pixels; got {width:g} and {height:g}")
     check_calibration(viewmat, K, int(width), int(height), where)
-    camera = Camera(jnp.asarray(viewmat, jnp.float32), jnp.asarray(K, jnp.float32), int(width), int(height))
-    check_camera(camera, where)
-    return camera
+    return Camera(jnp.asarray(viewmat, jnp.float32), jnp.asarray(K, jnp.float32), int(width), int(height))

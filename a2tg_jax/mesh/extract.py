@@ -16,7 +16,7 @@ from a2tg_jax import Camera, Model, Renderer, RenderSettings
 from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.text import counted
 from a2tg_jax.core.cameras import checked_cameras
-from a2tg_jax.data.capture_geometry import camera_centers, nearest_point, outlying_cameras
+from a2tg_jax.data.capture_geometry import camera_centers, outlying_cameras, subject_of
 from a2tg_jax.host.optional import optional
 from a2tg_jax.host.progress_bars import progress_over
 from a2tg_jax.mesh.fusion import SIDE, VOXELS, BlockGrid, GridFullError, Space, fuse, rendered_depth
@@ -187,8 +187,7 @@ def common_sphere(viewmats: ArrayLike, center: ArrayLike | None = None) -> tuple
     matrices = matrices[~outlying_cameras(matrices)]
     centers = camera_centers(matrices)
     if center is None:
-        # Row 2 of a rotation is the optical axis in the world.
-        center = nearest_point(centers, matrices[:, 2, :3]) if len(matrices) > 1 else centers[0]
+        center = subject_of(matrices)
     center = np.asarray(center, np.float64)
     return center, float(RADII * np.median(np.linalg.norm(centers - center, axis=1)))
 

@@ -114,8 +114,8 @@ def render_frames(
         a file that the viewer saved.
       name: model to render; None: the last one of the run's main system.
       edit: file of an edit that is applied before.
-      size: width and height of the frames, views being cropped to their aspect; None: the cameras' sizes for test
-        views, otherwise `FLIGHT_SIZE`, or upright if the first camera is.
+      size: width and height of the frames; an orbit shows whole views, and other views are cropped to their aspect;
+        None: the cameras' sizes for test views, otherwise `FLIGHT_SIZE`, or upright if the first camera is.
 
     Raises:
       ValueError, OSError: if that stage is not finished, the views or the path are missing, or a file is in the way.
@@ -130,7 +130,9 @@ def render_frames(
         first = next(iter(cameras.values()))
         size = FLIGHT_SIZE if first.width >= first.height else FLIGHT_SIZE[::-1]
     if size is not None:
-        cameras = {file_name: crop_camera(camera, *size) for file_name, camera in cameras.items()}
+        # Cropped turntables would cut off the subject, which photographs fill.
+        resized = widen_camera if route == "orbit" else crop_camera
+        cameras = {file_name: resized(camera, *size) for file_name, camera in cameras.items()}
     folder = FrameFolder(out)
     folder.check(cameras, overwrite=overwrite)
     settings = dataclasses.replace(source.settings, supersample=supersample)
@@ -215,8 +217,18 @@ def _cameras(model: Model, route: CameraPath | Path, num_frames: int) -> dict[st
 def crop_camera(camera: Camera, width: int, height: int) -> Camera:
     """Return the view of a pinhole camera at another image size and aspect: scaled to cover it, and cropped around its
     centre. Rays of a lens are left out."""
+    return _scaled(camera, width, height, max(width / camera.width, height / camera.height))
+
+
+def widen_camera(camera: Camera, width: int, height: int) -> Camera:
+    """Return the view of a pinhole camera at another image size and aspect: scaled to fit, with more of the scene at
+    two sides. Rays of a lens are left out."""
+    return _scaled(camera, width, height, min(width / camera.width, height / camera.height))
+
+
+def _scaled(camera: Camera, width: int, height: int, factor: float) -> Camera:
+    """Return a view scaled by a factor, with its centre in the middle of an image of another size."""
     camera = dataclasses.replace(camera, rays=None)
-    factor = max(width / camera.width, height / camera.height)
     scaled = resize_camera(camera, round(factor * camera.width), round(factor * camera.height))
     shift = jnp.asarray([(width - scaled.width) / 2, (height - scaled.height) / 2], camera.K.dtype)
     return Camera(camera.viewmat, scaled.K.at[:2, 2].add(shift), width, height)

@@ -96,6 +96,10 @@ export class Controls {
   }
 
   private wheel(event: WheelEvent): void {
+    // Within another page the wheel scrolls that page, until the scene is clicked.
+    const isFramed = window.parent !== window;
+    const isMeant = event.ctrlKey || event.metaKey || document.activeElement === this.canvas;
+    if (isFramed && !isMeant) return;
     event.preventDefault();
     const lines = event.deltaMode === WheelEvent.DOM_DELTA_PIXEL ? event.deltaY / 40 : event.deltaY;
     this.zoom(Math.exp(Math.max(-3, Math.min(3, lines)) * 0.06));
