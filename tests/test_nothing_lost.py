@@ -197,7 +197,7 @@ def test_the_error_of_a_full_disk_names_the_file(tmp_path, monkeypatch, capsys, 
             file.write(b"x")
 
     monkeypatch.setattr(cli.command_class("info"), "run", write)
-    assert cli.main(["info", "run"]) == 2
+    assert cli.main(["info", "."]) == 2
     where = rf"{tmp_path / 'x.npz'}: the disk is full( or has no inodes left)?, \d+\.\d MB are free"
     printed = where if is_ours else "the disk is full"
     error = capsys.readouterr().err
@@ -478,7 +478,7 @@ def test_restoring_has_an_end(scene, tmp_path):
 def test_a_signal_outside_training_ends_with_one_line(monkeypatch, capsys, number, code):
     monkeypatch.setattr(cli.command_class("info"), "run", lambda self: os.kill(os.getpid(), number))
     before = signal.getsignal(number)
-    assert cli.main(["info", "run"]) == code
+    assert cli.main(["info", "."]) == code
     assert capsys.readouterr().err == "a2tg: interrupted\n" and signal.getsignal(number) == before
 
 
@@ -549,14 +549,14 @@ def test_a_lack_of_memory_in_training_comes_with_advice(tmp_path, monkeypatch, c
 def test_a_lack_of_memory_outside_training_is_one_line(name, advice, monkeypatch, capsys):
     for printed, error in LACKS.items():
         monkeypatch.setattr(cli.command_class(name), "run", raising(error))
-        assert cli.main([name, "run"]) == 2
+        assert cli.main([name, "."]) == 2
         assert f"a2tg: error: {printed}{advice}" in capsys.readouterr().err
 
 
 def test_an_internal_error_is_not_reported_as_a_mistake_of_the_user(monkeypatch):
     monkeypatch.setattr(cli.command_class("info"), "run", raising(jax.errors.JaxRuntimeError("INTERNAL: a bug")))
     with pytest.raises(jax.errors.JaxRuntimeError, match="a bug"):
-        cli.main(["info", "run"])
+        cli.main(["info", "."])
 
 
 def test_a_run_with_a_file_budget_ends_with_its_file(tmp_path, monkeypatch, capsys):
