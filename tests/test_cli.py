@@ -183,7 +183,7 @@ def test_debugging_shows_the_traceback(tmp_path, monkeypatch):
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_during_the_imports_ends_in_one_line(monkeypatch, capsys, number, code):
     monkeypatch.setattr(cli, "command_class", lambda name: signal.raise_signal(number))
-    assert cli.main(["info", "run"]) == code and capsys.readouterr().err == "a2tg: interrupted\n"
+    assert cli.main(["info", "."]) == code and capsys.readouterr().err == "a2tg: interrupted\n"
 
 
 @pytest.mark.long
@@ -195,7 +195,7 @@ import sys, time
 from a2tg_jax.cli import main as cli, runs
 from a2tg_jax.data.colmap_library import pycolmap
 runs.Info.run = lambda _: (pycolmap(), print("ready", flush=True), time.sleep(60))
-sys.exit(cli.main(["info", "run"]))
+sys.exit(cli.main(["info", "."]))
 """
     process = subprocess.Popen([sys.executable, "-c", script], stdout=-1, stderr=-1, text=True)
     assert process.stdout is not None and process.stdout.readline() == "ready\n"
