@@ -424,7 +424,8 @@ def test_an_interrupted_run_says_how_to_continue(run, tmp_path, monkeypatch, cap
     for words in (["train", "--out", str(copy.path), "--resume"], ["demo", "--out", str(copy.path), "--resume"]):
         assert cli.main(words) == 130
         error = capsys.readouterr().err
-        assert f"a2tg-textures.npz; continue with: a2tg train --out {copy.path} --resume" in error
+        shows = f"show it with: a2tg view {copy.path} --model a2tg-textures"
+        assert f"a2tg-textures.npz; {shows}; continue with: a2tg train --out {copy.path} --resume" in error
 
 
 def test_run_folder_is_complete(run):
