@@ -182,9 +182,9 @@ def test_debugging_shows_the_traceback(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_during_the_imports_ends_in_one_line(monkeypatch, capsys, tmp_path, number, code):
+def test_a_signal_during_the_imports_ends_in_one_line(monkeypatch, capsys, number, code):
     monkeypatch.setattr(cli, "command_class", lambda name: signal.raise_signal(number))
-    assert cli.main(["info", str(tmp_path)]) == code and capsys.readouterr().err == "a2tg: interrupted\n"
+    assert cli.main(["info", "."]) == code and capsys.readouterr().err == "a2tg: interrupted\n"
 
 
 @pytest.mark.long
@@ -425,7 +425,8 @@ def test_an_interrupted_run_says_how_to_continue(run, tmp_path, monkeypatch, cap
     for words in (["train", "--out", str(copy.path), "--resume"], ["demo", "--out", str(copy.path), "--resume"]):
         assert cli.main(words) == 130
         error = capsys.readouterr().err
-        assert f"a2tg-textures.npz; continue with: a2tg train --out {copy.path} --resume" in error
+        shows = f"show it with: a2tg view {copy.path} --model a2tg-textures"
+        assert f"a2tg-textures.npz; {shows}; continue with: a2tg train --out {copy.path} --resume" in error
 
 
 def test_run_folder_is_complete(run):

@@ -15,9 +15,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from a2tg_jax import Camera, DepthMap, Mask, Picture, Scene, Similarity, View
+from a2tg_jax.base.even_spacing import evenly_chosen
 from a2tg_jax.base.text import counted, first_names, in_bytes
 from a2tg_jax.core.cameras import LARGEST_COORDINATE, MAX_SKEW, check_calibration
-from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.sight import FIRST_LOOK, Sight, unseeing
 from a2tg_jax.data.capture_geometry import (
     LEAST_FACING,
