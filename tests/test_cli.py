@@ -42,6 +42,7 @@ from a2tg_jax.training import SYSTEMS
 TINY = [
     *("--system", "a2tg", "--downscale", "5", "--stage1-iterations", "20", "--stage2-iterations", "20", "--baseline"),
     *("--initial-gaussians", "60", "--densify.cap", "60", "--texture.cap", "2", "--texture.at", "0.5"),
+    *("--loss.ssim-weight", "0"),
 ]
 """One upscaling event and few shapes: what takes time is compiling."""
 TENSORBOARD = ("--tensorboard",) if importlib.util.find_spec("tensorboardX") else ()

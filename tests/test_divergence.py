@@ -16,6 +16,7 @@ from a2tg_jax import (
     Gaussians2dMcmc,
     History,
     Interrupted,
+    LossConfig,
     Mcmc,
     StepEvent,
     allocate_appearance,
@@ -33,7 +34,8 @@ from a2tg_jax.training.divergence import _not_finite, largest_loss
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.start import initial_model
 
-SIZES = {"initial_gaussians": 60, "densify": Mcmc(cap=60)}
+SIZES = {"initial_gaussians": 60, "densify": Mcmc(cap=60), "sh_degree": 0, "loss": LossConfig(ssim_weight=0.0)}
+"""Small, in numbers and in what is compiled."""
 BAD_ROW = 7
 
 

@@ -26,6 +26,7 @@ from a2tg_jax import (
     DivergedError,
     Gaussians,
     Gaussians2dMcmc,
+    LossConfig,
     Mcmc,
     StepEvent,
     fit,
@@ -42,20 +43,19 @@ from a2tg_jax.host.errors import error_text
 from a2tg_jax.results import compression, run_evaluation, run_training, stage_training
 from a2tg_jax.results.folder import OLD, RunFolder, old_run, opened, put_back_old, set_aside
 from a2tg_jax.results.model_source import open_source
-from a2tg_jax.results.output_paths import check_apart
 from a2tg_jax.results.record import RunRecord, SceneSource, read_record, read_run_file, write_record
 from a2tg_jax.results.run_training import RunOptions, train_run
 from a2tg_jax.training.batches import BatchOrder
 from a2tg_jax.training.loop import StageRun
 
-SIZES = {"initial_gaussians": 60, "densify": Mcmc(cap=60)}
+SIZES = {"initial_gaussians": 60, "densify": Mcmc(cap=60), "loss": LossConfig(ssim_weight=0.0)}
 SOURCE = SceneSource("synthetic", downscale=6)
 RECORD = RunRecord(SOURCE, "gaussians-2d-mcmc", Gaussians2dMcmc(stage1_iterations=20, **SIZES))
 NAME = "gaussians-2d-mcmc-gaussians"
 QUIET = RunOptions(progress=False)
 TRAIN = [
     *("train", "synthetic", "--system", "gaussians-2d-mcmc", "--downscale", "6", "--stage1-iterations", "20"),
-    *("--initial-gaussians", "60", "--densify.cap", "60"),
+    *("--initial-gaussians", "60", "--densify.cap", "60", "--loss.ssim-weight", "0"),
 ]
 
 
@@ -296,11 +296,19 @@ def test_an_unfinished_replacement_never_costs_the_finished_run(tmp_path):
 # Before training
 
 
-def test_the_run_folder_and_the_scene_must_not_overlap(tmp_path):
-    for out, scene in ((tmp_path / "scene/run", tmp_path / "scene"), (tmp_path, tmp_path / "scene")):
-        with pytest.raises(ValueError, match="overlap: choose an output folder"):
-            check_apart(out, scene)
-    check_apart(tmp_path / "scene-run", tmp_path / "scene")
+@pytest.mark.parametrize(
+    ("out", "message"),
+    [
+        ("scene/run", "overlap: choose an output folder"),
+        (".", "overlap: choose an output folder"),
+        ("scene-run", "has no sparse model"),
+    ],
+)
+def test_the_run_folder_and_the_scene_must_not_overlap(tmp_path, monkeypatch, capsys, out, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene").mkdir()
+    assert cli.main(["train", "scene", "--out", out]) == 2
+    assert message in capsys.readouterr().err
 
 
 def test_a_full_disk_is_seen_before_training(tmp_path, monkeypatch, capsys):

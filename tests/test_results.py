@@ -49,7 +49,7 @@ from a2tg_jax.results.folder import OLD, RunFolder, check_free, drop_old, open_r
 from a2tg_jax.results.history import EventWriter, read_history, write_history
 from a2tg_jax.results.images import to_uint8
 from a2tg_jax.results.info import describe_run
-from a2tg_jax.results.output_paths import check_export, check_new, check_output
+from a2tg_jax.results.output_paths import check_export, check_output
 from a2tg_jax.results.plan import plan_run
 from a2tg_jax.results.record import RunRecord, SceneSource, contradictions, read_record, read_run_file, write_record
 from a2tg_jax.results.report import (
@@ -271,6 +271,7 @@ def a_model():
         ("export model.npz --web site", "site/photographs.json", "photographs.json exists"),
         ("compress model.npz --out x.a2tgz", "x.a2tgz", "x.a2tgz exists; add --overwrite"),
         ("mesh run", "run/mesh.glb", "mesh.glb exists; add --overwrite"),
+        ("convert model.npz x.ply", "x.ply", "x.ply exists; add --overwrite"),
         ("export scene.ply --overwrite --single-file --web scene.ply", "", "the model itself; choose another --web"),
     ],
 )
@@ -313,9 +314,6 @@ def test_exports_into_a_run_are_replaced_by_default_or_on_request(tmp_path, name
     check_export(path, path, "--out", overwrite=False)
     with contextlib.nullcontext() if is_export else pytest.raises(ValueError, match="belongs to the run"):
         check_export(path, tmp_path / "other", "--out", overwrite=True)
-    if is_export:
-        with pytest.raises(FileExistsError, match="add `overwrite`"):
-            check_new(path, "OUT", overwrite=False)
 
 
 def test_the_mesh_of_a_run_is_replaced_by_default_once_the_command_has_written_it(tmp_path, monkeypatch):

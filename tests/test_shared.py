@@ -107,8 +107,8 @@ class Own(a2tg.System):
     def stages(self):
         rates = {"network": self.shared_rate, "codes": 1e-2} if self.shown == "painted" else 1e-2
         stage = a2tg.Stage(
-            self.shown, APPEARANCES[self.shown], EVENTS[self.events], self.loss.terms(), self.rates,
-            self.stage1_iterations, rates,
+            self.shown, APPEARANCES[self.shown], EVENTS[self.events], a2tg.LossConfig(ssim_weight=0.0).terms(),
+            self.rates, self.stage1_iterations, rates,
         )  # fmt: skip
         return (stage,)
 
