@@ -181,7 +181,7 @@ from .training.gradients import (
 )
 from .training.losses import normal_consistency as normal_consistency, photometric_loss as photometric_loss
 from .training.options import Corrections as Corrections
-from .training.reports import Display as Display
+from .training.reports import Display as Display, Progress as Progress, RestOfRun as RestOfRun
 from .training.stage import LossTerm as LossTerm
 
 __version__: str

@@ -7,6 +7,7 @@ either happens inside the step, at fixed shapes (`StepEvent`), or between steps 
 """
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
@@ -28,6 +29,8 @@ from a2tg_jax.core.pytree import combine, partition, pytree
 from a2tg_jax.core.table import Layout, map_rows, rows_moved
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.pixel import Statistic as Statistic
+from a2tg_jax.rasterize.render_types import RenderSettings
+from a2tg_jax.rasterize.room import TileRoom, most_pairs
 from a2tg_jax.scene import View
 
 LEAST_LEFT = 2
@@ -111,6 +114,20 @@ class Due(NamedFields):
     """Random seed of the system, for draws of the event."""
     layouts: set[Layout] = dataclasses.field(default_factory=set)
     """Layouts of textures that steps are compiled for; an event adds the one that it makes."""
+    room: TileRoom = dataclasses.field(default_factory=TileRoom)
+    """Capacities of tile lists that steps are compiled for."""
+
+    def render_settings(self, model: Model, views: Sequence[View]) -> RenderSettings:
+        """Return settings for renders of some views, with the capacity of steps if it suffices (host). ValueError:
+        there are no views."""
+        if not views:
+            raise ValueError("views must hold at least one view; got none")
+        settings = RenderSettings()
+        cameras = [view.camera for view in views]
+        pairs = most_pairs(model.gaussians, cameras, model.appearance, settings, model.num_live)
+        # As in the training loop.
+        place = model.appearance.template, model.num_rows, *max(view.picture.size for view in views)
+        return dataclasses.replace(settings, capacity=self.room.plan(place, pairs, most=math.inf))
 
 
 class EventInfo(NamedTuple):
@@ -182,7 +199,7 @@ class Event(NamedFields):
         """
         if self.statistic is None:
             return ()
-        return GradientStatistics.init(model.gaussians.num, model.gaussians.means.dtype)
+        return GradientStatistics.init(model.num_rows, model.gaussians.means.dtype)
 
     def gather(self, state: Any, rows: np.ndarray) -> Any:
         """Return the state whose row i is the former row rows[i] (host). ValueError: by default, if an array that is no
@@ -285,7 +302,7 @@ def keep_rows(model: Model, moments: AdamState, state: object, is_kept: Array | 
         sizes.
     """
     num = model.num
-    rows = np.arange(model.gaussians.num, dtype=np.int32)
+    rows = np.arange(model.num_rows, dtype=np.int32)
     is_kept = np.asarray(is_kept)
     check_mask("is_kept", is_kept, (len(rows) if is_kept.shape == rows.shape else num,))
     is_kept = is_kept[:num]

@@ -360,7 +360,7 @@ class Mcmc(StepEvent):
         # Dead Gaussians move first: their new places can be hosts of what is added.
         moved, moments, _ = self._move(model, moments, functools.partial(plan_relocation, now.keys[0]))
         least = self.least(now, model.live_count)
-        cap = min(self.cap, model.gaussians.num)
+        cap = min(self.cap, model.num_rows)
         plan = functools.partial(plan_growth, now.keys[1], cap=cap, least=least)
         model, moments, info = self._move(moved, moments, plan)
         return Change(model, moments, state, EventInfo(is_possible=info.has_hosts))

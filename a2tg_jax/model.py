@@ -112,12 +112,17 @@ class Model(NamedFields):
     @property
     def num(self) -> int:
         """Number of Gaussians that exist (host)."""
-        return self.gaussians.num if self.num_live is None else int(self.num_live)
+        return self.num_rows if self.num_live is None else int(self.num_live)
+
+    @property
+    def num_rows(self) -> int:
+        """Number of allocated rows, of which the first `num` exist."""
+        return self.gaussians.num
 
     @property
     def live_count(self) -> Array:
         """Number of Gaussians that exist, [] int32; may be traced."""
-        return jnp.asarray(self.gaussians.num if self.num_live is None else self.num_live, jnp.int32)
+        return jnp.asarray(self.num_rows if self.num_live is None else self.num_live, jnp.int32)
 
     @property
     def num_bytes(self) -> int:
@@ -167,7 +172,7 @@ class Model(NamedFields):
         Raises:
           ValueError: if it has none, where the message says how to build one that has, or their numbers differ.
         """
-        check_textures(textures, self.gaussians.num)
+        check_textures(textures, self.num_rows)
         return dataclasses.replace(self, appearance=self.appearance.with_textures(textures))
 
     @property
@@ -176,7 +181,7 @@ class Model(NamedFields):
         base = self.gaussians.sh_degree
         coefficients = self.appearance.coefficients
         if coefficients is None:
-            return np.full(self.gaussians.num, base)
+            return np.full(self.num_rows, base)
         return degrees_of_sizes(coefficients.sizes, base)
 
     @property
@@ -195,7 +200,7 @@ class Model(NamedFields):
         """Return the same model with other spherical harmonics, as `sh` gives them; degrees stay (host). ValueError:
         they have another shape."""
         base = self.gaussians.sh_degree
-        check_shape("sh", sh, (self.gaussians.num, "K", 3))
+        check_shape("sh", sh, (self.num_rows, "K", 3))
         common = jnp.asarray(sh[:, : NUM_BASES[base]], self.gaussians.sh.dtype)
         model = dataclasses.replace(self, gaussians=dataclasses.replace(self.gaussians, sh=common))
         if self.appearance.coefficients is None:

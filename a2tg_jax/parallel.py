@@ -32,17 +32,6 @@ def mesh_of(devices: Sequence[jax.Device] | None) -> Mesh | None:
     return jax.make_mesh((len(devices),), (AXIS,), axis_types=(AxisType.Auto,), devices=devices)
 
 
-def check_batch_size(batch_size: int, num_devices: int) -> None:
-    """Raise ValueError unless each device draws the same number of views."""
-    if batch_size % num_devices:
-        fitting = [str(number) for number in range(1, num_devices) if batch_size % number == 0]
-        raise ValueError(
-            f"batch_size must be a multiple of the {num_devices} devices, because a device draws whole views; got "
-            f"{batch_size}: take {num_devices} or a multiple of it, or {' or '.join(fitting)} of the devices (others "
-            "would have nothing to draw)"
-        )
-
-
 # Inside the step
 
 

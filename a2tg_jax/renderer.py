@@ -9,10 +9,10 @@ from numpy.typing import ArrayLike
 from a2tg_jax.appearance import Appearance, check_is_appearance
 from a2tg_jax.appearance.base import num_colors_of
 from a2tg_jax.base.checks import check_kind, check_number
+from a2tg_jax.base.even_spacing import evenly_chosen
 from a2tg_jax.base.text import counted
 from a2tg_jax.core.cameras import Camera, check_camera, checked_cameras, resize_camera
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
-from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
 from a2tg_jax.rasterize.room import HEAD_ROOM, TileRoom, has_rows, most_pairs, warn_of_empty

@@ -10,11 +10,11 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.base.checks import check_array, check_kind, check_number, check_shape
+from a2tg_jax.base.even_spacing import evenly_chosen
 from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.text import counted, shortened
 from a2tg_jax.core.cameras import Camera, check_camera, check_is_camera
 from a2tg_jax.core.notebook_display import THUMBNAIL, enlarged, html_image, png
-from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.origin import BLACK, Origin
 from a2tg_jax.core.pictures import DepthMap, Mask, Picture
 from a2tg_jax.core.similarity import Similarity, check_similarity

@@ -81,10 +81,10 @@ def measured(num_devices: int, num: int, steps: int) -> dict[str, Any]:
     devices = jax.devices()[:num_devices]
     session = a2tg.Session(devices=devices if num_devices > 1 else None)
     run = StageRun(scene, system, 0, initial_model(scene, system), session=session)
-    arguments = run.arguments(1)
-    compiled = jitted_step().lower(*arguments).compile()
+    settings, state, inputs = run.arguments(1)
+    compiled = jitted_step().lower(settings, state, inputs).compile()
     memory = compiled.memory_analysis()
-    photographs = sum(leaf.nbytes for leaf in jax.tree.leaves(arguments[4]))
+    photographs = sum(leaf.nbytes for leaf in jax.tree.leaves(inputs.photographs))
     found: dict[str, Any] = {
         "devices": num_devices,
         "gaussians": run.state.model.gaussians.num,

@@ -73,12 +73,12 @@ def measure_step(case: dict) -> dict:
     textures = random_textures(case["num"], kind)
     size = case["width"], case["height"]
     made = training_step(system, index, case["num"], size, textures, tile_size=tile_size)
-    stage, clock, state, *others = jax.device_put(made.given)
-    run = jax.jit(made.run, donate_argnums=2)
+    state, inputs = jax.device_put(made.given)
+    run = jax.jit(made.run, donate_argnums=0)
     latest = [state]
 
     def step():
-        latest[0], info = run(stage, clock, latest[0], *others)
+        latest[0], info = run(latest[0], inputs)
         return info
 
     return {"step": timed(step)}

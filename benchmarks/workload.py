@@ -12,7 +12,8 @@ import a2tg_jax
 from a2tg_jax.model import Model
 from a2tg_jax.training import find_system
 from a2tg_jax.training.batches import Photographs
-from a2tg_jax.training.step import StepSettings, initial_state, train_step
+from a2tg_jax.training.start import initial_state
+from a2tg_jax.training.step import StepInputs, StepSettings, train_step
 from benchmarks.arrays import camera_matrices, random_splats
 
 NUM_PHOTOGRAPHS = 8
@@ -53,8 +54,7 @@ class TrainingStep(NamedTuple):
     """A training step between two events, of a preset "paper"."""
 
     run: Callable
-    """(stage, clock, state, photographs, views, scene scale, key) to the next state and figures; the state may be
-    donated."""
+    """(state, inputs with the data of a key) to the next state and figures; the state may be donated."""
     given: tuple[Any, ...]
     """Its arguments."""
 
@@ -81,9 +81,11 @@ def training_step(
     noise = np.random.default_rng(1).integers(0, 256, (NUM_PHOTOGRAPHS, height, width, 3), dtype=np.uint8)
     photographs = Photographs(stack(camera.viewmat), stack(camera.K), noise, None)
     key = jax.random.key_data(jax.random.key(0))
-    given = stage, clock, initial_state(stage, model), photographs, np.zeros(1, np.int32), np.float32(1), key
+    chosen = np.zeros(1, np.int32)
+    inputs = StepInputs(stage, clock, photographs, chosen, views=None, scene_scale=np.float32(1), key=key)
+    given = initial_state(stage, model), inputs
 
-    def run(stage, clock, state, photographs, views, scale, key):
-        return train_step(step, stage, clock, state, photographs, views, scale, jax.random.wrap_key_data(key))
+    def run(state, inputs):
+        return train_step(step, state, inputs._replace(key=jax.random.wrap_key_data(inputs.key)))
 
     return TrainingStep(run, given)

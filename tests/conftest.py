@@ -16,6 +16,7 @@ import jax
 import psutil
 import pytest
 
+from a2tg_jax import set_num_threads
 from a2tg_jax.base.operating_system import trim_heap
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -29,7 +30,8 @@ READERS = pathlib.Path(__file__).resolve().parents[1] / "docs" / "reference"
 
 
 LONGEST = {
-    "test_bytewise", "test_devices", "test_experiments", "test_processes", "test_systems", "test_viewer_browser",
+    "test_bytewise", "test_devices", "test_experiments", "test_processes", "test_systems", "test_training",
+    "test_viewer_browser",
 }  # fmt: skip
 """Files that come first, so that no process is left with one of them while the others have nothing to do."""
 MOST_BYTES = 2.5e9
@@ -89,6 +91,14 @@ def x64():
     """Runs the test with 64-bit floats."""
     with jax.enable_x64(True):
         yield
+
+
+@pytest.fixture
+def threads(monkeypatch):
+    """Neither `set_num_threads` nor the environment has set a number of threads, nor does the test's stay."""
+    monkeypatch.delenv("A2TG_NUM_THREADS", raising=False)
+    yield
+    set_num_threads(None)
 
 
 @pytest.fixture

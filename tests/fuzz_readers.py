@@ -10,7 +10,7 @@ BINARY = (mutate.of_bytes,)
 TEXT = (mutate.of_text, mutate.of_text, mutate.of_bytes)
 JSON = (mutate.of_json, mutate.of_json, mutate.of_json, mutate.of_text, mutate.of_bytes)
 ARCHIVE = (mutate.of_npz, mutate.of_npz, mutate.of_npz, mutate.of_bytes)
-COLMAP = ("cameras", "images", "points3D", "rigs", "frames")
+COLMAP = ("cameras", "images", "points3D")
 OF_RUN = ("metrics.json", ".a2tg-run")
 KSPLAT = ("0-degree1", "1-degree2", "2-degree2")
 DEPTHS = ("depth", "confidence")
@@ -34,8 +34,7 @@ class Reader:
 
 
 READERS = (
-    *(Reader("colmap", (f"sparse/0/{kind}.bin",), BINARY, "scene") for kind in COLMAP[:3]),
-    Reader("colmap", tuple(f"sparse/0/{kind}.bin" for kind in COLMAP[3:]), BINARY, "scene"),
+    *(Reader("colmap", (f"sparse/0/{kind}.bin",), BINARY, "scene") for kind in COLMAP),
     Reader("colmap-text", tuple(f"sparse/0/{kind}.txt" for kind in COLMAP), TEXT, "scene"),
     Reader("nerfstudio", ("transforms.json",), JSON, "scene"),
     Reader("masks", ("masks/00.png", "masks/01.png", "images/00.png"), (mutate.of_bytes, mutate.of_png), "scene"),

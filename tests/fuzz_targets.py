@@ -16,7 +16,7 @@ from a2tg_jax.results.folder import RunFolder, check_free, open_run
 from a2tg_jax.results.history import read_history
 from a2tg_jax.results.info import describe_run
 from a2tg_jax.results.record import read_record
-from a2tg_jax.training.step import initial_state
+from a2tg_jax.training.start import initial_state
 
 
 def _scene(folder: Path, file: Path) -> None:

@@ -254,7 +254,7 @@ def memory(folder):
     arguments = run.arguments(1)
     said = jitted_step().lower(*arguments).compile().memory_analysis()
     model_bytes = run.model.num_bytes
-    rest = sum(leaf.nbytes for leaf in jax.tree.leaves(arguments[4]))
+    rest = sum(leaf.nbytes for leaf in jax.tree.leaves(arguments[2].photographs))
     assert said.argument_size_in_bytes < 3 * model_bytes / 4 + rest + 10_000
     run.photographs.close()
 

@@ -9,7 +9,7 @@ import numpy as np
 import a2tg_jax as a2tg
 from a2tg_jax import Bands, Checkpoint, History, Model, Now, Origin, allocate_appearance, init_from_points
 from a2tg_jax.appearance.parts import bands_of_dense
-from a2tg_jax.training.step import initial_state
+from a2tg_jax.training.start import initial_state
 
 NUM = 12
 

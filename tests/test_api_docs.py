@@ -101,7 +101,7 @@ def test_every_argument_and_result_is_described(name):
 
 INTERNAL = {
     "BandStatistics", "Clock", "CloneSplitPlan", "Coefficients", "Devices", "Event", "KernelRates", "Machine",
-    "Progress", "RecordedViews", "Layout", "SplitStatistics", "TrainState",
+    "Layout", "RecordedViews", "SplitStatistics", "TileRoom", "TrainState",
 }  # fmt: skip
 """Types in public signatures whose values users only pass on, or give as mappings."""
 

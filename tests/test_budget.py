@@ -33,7 +33,7 @@ from a2tg_jax.core.budget import number_to_reach
 from a2tg_jax.training import SYSTEMS
 from a2tg_jax.training.fitting import warn_of_budget
 from a2tg_jax.training.registry import system_from_dict, system_to_dict
-from a2tg_jax.training.start import check_start
+from a2tg_jax.training.start import check_points
 
 SHORT = {"stage1_iterations": 60, "initial_gaussians": None}
 
@@ -281,10 +281,10 @@ def test_budgets_that_the_points_of_a_scene_cannot_fill_are_refused(scene, name,
     system = smoke(name, **changes)
     advice = "raise stage1_iterations or initial_gaussians, or lower memory_budget"
     message = rf"^memory_budget has room for [\d,]+ Gaussians, but {message}.*: {advice}$"
-    for start in (check_start, a2tg.fit):
+    for start in (check_points, a2tg.fit):
         with pytest.raises(ValueError, match=message):
             start(scene, system)
-    check_start(scene, smoke(name, memory_budget="60kB"))
+    check_points(scene, smoke(name, memory_budget="60kB"))
     system.check_given_number(120)
 
 
@@ -292,7 +292,7 @@ def test_a_budget_of_textures_has_room_for_growth_only_where_there_is_some(scene
     changes = {"texture": {"select": "budget", "budget_mb": 0.03}, "initial_gaussians": None}
     system = a2tg.A2tg.preset("smoke", **changes)
     with pytest.raises(ValueError, match=r"0\.03, but \d+ Gaussians .*: raise it, or lower densify\.cap$"):
-        check_start(scene, system)
+        check_points(scene, system)
     most = 30_000 // (4 * (10 + 3 * (system.sh_degree + 1) ** 2 + 4))
     system.check_given_number(most)
     with pytest.raises(ValueError, match=rf"0\.03, but {most + 1} Gaussians of one texel each .* MB: raise it$"):
@@ -306,22 +306,22 @@ def test_a_budget_of_textures_is_checked_before_the_first_stage(scene, cap):
     texture = {"select": "budget", "budget_mb": 0.0297}
     system = smoke("a2tg", stage1_iterations=10, densify=densify, texture=texture)
     option = "densify.cap" if cap else "initial_gaussians"
-    for start in (check_start, a2tg.fit):
+    for start in (check_points, a2tg.fit):
         with pytest.raises(ValueError, match=rf"but 120 Gaussians .* take 0\.030 MB: raise it, or lower {option}$"):
             start(scene, system)
     with pytest.raises(ValueError, match=r"but 120 Gaussians .*: raise it$"):
         system.check_given_number(120)
     smaller = dataclasses.replace(system.texture, budget_mb=0.0298)
-    check_start(scene, dataclasses.replace(system, texture=smaller))
+    check_points(scene, dataclasses.replace(system, texture=smaller))
 
 
 def test_textures_that_begin_empty_take_nothing_of_a_budget(scene):
     """120 Gaussians of 232 bytes, or 236 with a shape of the kernel."""
     texture = {"select": "budget", "budget_mb": 120 * 232 / 1e6}
     changes = {"stage1_iterations": 10, "texture": texture, "empty_textures": True}
-    check_start(scene, smoke("a2tg", **changes))
+    check_points(scene, smoke("a2tg", **changes))
     with pytest.raises(ValueError, match=r"but 120 Gaussians without textures take 0\.028 MB: raise it, or lower"):
-        check_start(scene, smoke("a2tg", **changes, kernel_rate=0.01))
+        check_points(scene, smoke("a2tg", **changes, kernel_rate=0.01))
     given = smoke("a2tg", memory_budget=120 * 232 / 1e6, empty_textures=True)
     given.check_given_number(120)
     with pytest.raises(ValueError, match=r"has room for 120 Gaussians of 232 bytes .* and 121 are given"):
@@ -367,7 +367,7 @@ def test_presets_reach_ordinary_budgets(scene, name, preset):
     for budget in ("1.5MB", "20MB", "80MB"):
         system = dataclasses.replace(type(a2tg.find_system(name)).preset(preset), memory_budget=budget)
         system.check()
-        check_start(scene, system)
+        check_points(scene, system)
 
 
 @pytest.mark.long

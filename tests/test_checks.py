@@ -11,8 +11,8 @@ from small_values import some_gaussians, some_world
 
 import a2tg_jax as a2tg
 from a2tg_jax.base.checks import check_floats, check_number, check_shape, described
+from a2tg_jax.base.even_spacing import evenly_chosen
 from a2tg_jax.base.text import shortened
-from a2tg_jax.core.numerics import evenly_chosen
 
 CAMERA = a2tg.Camera(jnp.eye(4).at[2, 3].set(3), jnp.array([[20.0, 0, 8], [0, 20, 6], [0, 0, 1]]), 16, 12)
 SETTINGS = a2tg.RenderSettings(capacity=1024)

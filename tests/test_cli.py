@@ -42,6 +42,7 @@ from a2tg_jax.training import SYSTEMS
 TINY = [
     *("--system", "a2tg", "--downscale", "5", "--stage1-iterations", "20", "--stage2-iterations", "20", "--baseline"),
     *("--initial-gaussians", "60", "--densify.cap", "60", "--texture.cap", "2", "--texture.at", "0.5"),
+    *("--loss.ssim-weight", "0"),
 ]
 """One upscaling event and few shapes: what takes time is compiling."""
 TENSORBOARD = ("--tensorboard",) if importlib.util.find_spec("tensorboardX") else ()
@@ -183,7 +184,7 @@ def test_debugging_shows_the_traceback(tmp_path, monkeypatch):
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_during_the_imports_ends_in_one_line(monkeypatch, capsys, number, code):
     monkeypatch.setattr(cli, "command_class", lambda name: signal.raise_signal(number))
-    assert cli.main(["info", "run"]) == code and capsys.readouterr().err == "a2tg: interrupted\n"
+    assert cli.main(["info", "."]) == code and capsys.readouterr().err == "a2tg: interrupted\n"
 
 
 @pytest.mark.long
@@ -195,7 +196,7 @@ import sys, time
 from a2tg_jax.cli import main as cli, runs
 from a2tg_jax.data.colmap_library import pycolmap
 runs.Info.run = lambda _: (pycolmap(), print("ready", flush=True), time.sleep(60))
-sys.exit(cli.main(["info", "run"]))
+sys.exit(cli.main(["info", "."]))
 """
     process = subprocess.Popen([sys.executable, "-c", script], stdout=-1, stderr=-1, text=True)
     assert process.stdout is not None and process.stdout.readline() == "ready\n"
@@ -424,7 +425,8 @@ def test_an_interrupted_run_says_how_to_continue(run, tmp_path, monkeypatch, cap
     for words in (["train", "--out", str(copy.path), "--resume"], ["demo", "--out", str(copy.path), "--resume"]):
         assert cli.main(words) == 130
         error = capsys.readouterr().err
-        assert f"a2tg-textures.npz; continue with: a2tg train --out {copy.path} --resume" in error
+        shows = f"show it with: a2tg view {copy.path} --model a2tg-textures"
+        assert f"a2tg-textures.npz; {shows}; continue with: a2tg train --out {copy.path} --resume" in error
 
 
 def test_run_folder_is_complete(run):

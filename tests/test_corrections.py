@@ -15,6 +15,7 @@ from a2tg_jax import (
     Exposure,
     Gaussians2d,
     Gaussians2dMcmc,
+    LossConfig,
     Mcmc,
     PoseRefinement,
     adam_init,
@@ -34,7 +35,7 @@ from a2tg_jax.training.corrections import initial_corrections, updated
 
 SYSTEM = Gaussians2dMcmc(
     stage1_iterations=24, stage2_iterations=16, initial_gaussians=80, densify=Mcmc(cap=90), exposure=True,
-    refine_poses=True,
+    refine_poses=True, sh_degree=0, loss=LossConfig(ssim_weight=0.0),
 )  # fmt: skip
 
 

@@ -10,7 +10,7 @@ from PIL import ExifTags, Image, ImageOps
 from test_data_transforms import dot_place as place_of, save_dot, shares_seen
 
 from a2tg_jax import load_scene, view_image
-from a2tg_jax.data.colmap import _model_of, _read_model, viewmat_of
+from a2tg_jax.data.colmap import _model_of, _panoramas, _read_model, viewmat_of
 from a2tg_jax.data.colmap_cameras import MODELS, ColmapCamera
 from a2tg_jax.data.colmap_library import pycolmap
 
@@ -511,7 +511,7 @@ def test_a_lens_that_folds_can_be_kept_as_the_error_says(tmp_path, monkeypatch):
 
 @both_formats
 def test_files_say_what_pycolmap_reads_in_them(tmp_path, text):
-    """Poses, points and the frames of rigs, in a model of several rigs whose images have features."""
+    """Poses and points, in a model of several rigs whose images have features."""
     with_tracks(tmp_path, text)
     model = _read_model(_model_of(tmp_path))
     expected = pycolmap().Reconstruction(str(tmp_path / "sparse" / "0"))
@@ -523,6 +523,9 @@ def test_files_say_what_pycolmap_reads_in_them(tmp_path, text):
     for point in model.points:
         assert (point["position"] == expected.points3D[point["id"]].xyz).all()
         assert (point["color"] == expected.points3D[point["id"]].color).all()
-    assert {frame.id: (frame.rig_id, frame.image_ids) for frame in model.frames} == {
-        key: (frame.rig_id, [data.id for data in frame.data_ids]) for key, frame in expected.frames.items()
-    }
+
+
+def test_a_camera_far_away_does_not_make_the_others_one_place():
+    viewmats = np.tile(np.eye(4), (7, 1, 1))
+    viewmats[:, 0, 3] = [0, 0, 1, 1 + 1e-5, 2, 3, 1e9]
+    assert _panoramas(viewmats) == [0, 0, 2, 2, None, None, None]

@@ -10,7 +10,6 @@ import pytest
 
 from a2tg_jax import Session
 from a2tg_jax.cli import main as cli
-from a2tg_jax.parallel import check_batch_size
 
 SCRIPT = pathlib.Path(__file__).with_name("on_devices.py")
 LONG = ("lenses", "training", "textures", "events", "details", "shared", "memory")
@@ -32,10 +31,12 @@ def test_devices_of_a_session_are_several():
 
 
 def test_views_that_devices_cannot_share_are_refused():
-    check_batch_size(1, 1)
-    check_batch_size(8, 4)
+    session = Session()
+    session.check_batch_size(1)
+    session.num_devices = 4
+    session.check_batch_size(8)
     with pytest.raises(ValueError, match=r"of the 4 devices, .*; got 1: take 4 or a multiple of it, or 1 of"):
-        check_batch_size(1, 4)
+        session.check_batch_size(1)
 
 
 @pytest.mark.long

@@ -16,6 +16,7 @@ from a2tg_jax import (
     Gaussians2dMcmc,
     History,
     Interrupted,
+    LossConfig,
     Mcmc,
     StepEvent,
     allocate_appearance,
@@ -33,7 +34,8 @@ from a2tg_jax.training.divergence import _not_finite, largest_loss
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.start import initial_model
 
-SIZES = {"initial_gaussians": 60, "densify": Mcmc(cap=60)}
+SIZES = {"initial_gaussians": 60, "densify": Mcmc(cap=60), "sh_degree": 0, "loss": LossConfig(ssim_weight=0.0)}
+"""Small, in numbers and in what is compiled."""
 BAD_ROW = 7
 
 
@@ -101,11 +103,12 @@ def test_parameters_that_nothing_but_adam_changed_are_not_checked_again(scene, m
     monkeypatch.setattr(jax.lax, "optimization_barrier", lambda rows: sizes.append(rows.size) or rows)
     system = Gaussians2dMcmc(stage1_iterations=10, **SIZES)
     run = StageRun(scene, system, 0, initial_model(scene, system))
-    settings, stage, _, _, *others = run.arguments(1)
-    settings = dataclasses.replace(settings, due=(True,))
-    stage = dataclasses.replace(stage, events=(Brighten(),))
-    state = dataclasses.replace(run.state, events=(None,))
-    jax.eval_shape(lambda state: step.attempt(settings, stage, stage.clock(1), state, *others), state)
+    settings, state, inputs = run.arguments(1)
+    settings = dataclasses.replace(settings, happens=(True,))
+    stage = dataclasses.replace(inputs.stage, events=(Brighten(),))
+    state = dataclasses.replace(state, events=(None,))
+    inputs = inputs._replace(stage=stage, clock=stage.clock(1))
+    jax.eval_shape(lambda state: step.attempt(settings, state, inputs), state)
     assert sizes == [1 + 5 * 60 + 60], "the loss, five gradients and the colours"
 
 

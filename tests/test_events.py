@@ -18,7 +18,8 @@ from a2tg_jax import adam_init, combine, partition
 from a2tg_jax.training import loop
 from a2tg_jax.training.cost import forecast_stages
 from a2tg_jax.training.reports import StageEffects
-from a2tg_jax.training.step import initial_state, jitted_step
+from a2tg_jax.training.start import initial_state
+from a2tg_jax.training.step import jitted_step
 
 
 @pytest.fixture(scope="module")

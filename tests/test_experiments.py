@@ -24,13 +24,16 @@ from run import experiments, interruptible, main, parse_arguments
 import a2tg_jax as a2tg
 from a2tg_jax import fit_stage
 
+SMALL = {"sh_degree": 0, "loss": {"ssim_weight": 0.0}}
+"""Less to compile."""
+
 
 def test_a_stage_stopped_under_one_system_continues_under_another(tmp_path, monkeypatch):
     """From a checkpoint under the name that sweeps gave it before, and to the same model, bit for bit."""
     scene = a2tg.synthetic_scene(num_views=3, width=24, height=16, num_points=30)
     monkeypatch.setattr(Folders, "load_scene", lambda self, job: scene)
-    plain = a2tg.find_system("gaussians-2d-mcmc").preset("smoke", stage1_iterations=4)
-    textured = a2tg.find_system("textured-gaussians").preset("smoke", stage1_iterations=4)
+    plain = a2tg.find_system("gaussians-2d-mcmc").preset("smoke", **SMALL, stage1_iterations=4)
+    textured = a2tg.find_system("textured-gaussians").preset("smoke", **SMALL, stage1_iterations=4)
     job = Job("synthetic", 1, textured, 0)
     assert job.key == dataclasses.replace(job, system=plain).key
     folders = Folders(tmp_path, tmp_path)
@@ -51,7 +54,7 @@ def test_a_stage_stopped_under_one_system_continues_under_another(tmp_path, monk
 def test_the_checkpoint_before_a_damaged_one_continues_a_stage(tmp_path, monkeypatch):
     scene = a2tg.synthetic_scene(num_views=3, width=24, height=16, num_points=30)
     monkeypatch.setattr(Folders, "load_scene", lambda self, job: scene)
-    job = Job("synthetic", 1, a2tg.find_system("gaussians-2d-mcmc").preset("smoke", stage1_iterations=4), 0)
+    job = Job("synthetic", 1, a2tg.find_system("gaussians-2d-mcmc").preset("smoke", **SMALL, stage1_iterations=4), 0)
     folders = Folders(tmp_path, tmp_path)
     files = folders.files
     keep = lambda checkpoint: a2tg.save_checkpoint(files.checkpoint(job.key, checkpoint.iteration), checkpoint)  # noqa: E731
@@ -78,7 +81,7 @@ class AfterQuestions:
 def test_a_stage_stops_at_its_time_and_is_timed_only_if_it_ran_alone(tmp_path, monkeypatch):
     scene = a2tg.synthetic_scene(num_views=3, width=24, height=16, num_points=30)
     monkeypatch.setattr(Folders, "load_scene", lambda self, job: scene)
-    system = a2tg.find_system("gaussians-2d-mcmc").preset("smoke", stage1_iterations=20, stage2_iterations=0)
+    system = a2tg.find_system("gaussians-2d-mcmc").preset("smoke", **SMALL, stage1_iterations=20, stage2_iterations=0)
     job, folders = Job("synthetic", 1, system, 0), Folders(tmp_path, tmp_path)
     assert run_job(job, folders, stop_at=time.monotonic()) is None
     assert not folders.files.checkpoints(job.key), "the beginning needs none"

@@ -378,7 +378,7 @@ def test_the_pace_is_reported_once_when_enough_was_timed():
 
     def told(done, num_compiled=1):
         pace.time(done, num_compiled)
-        return pace.due_forecast(done)
+        return pace.forecast_at(done)
 
     assert told(10) is None  # The steps of the compilation.
     assert told(20) is None
@@ -401,7 +401,7 @@ def test_the_pace_counts_the_programs_ahead(seconds, dones, programs, expected):
     pace = pace_of(seconds)
     for done in dones:
         pace.time(done, 1, *programs)
-    told = pace.due_forecast(dones[-1])
+    told = pace.forecast_at(dones[-1])
     assert told == expected
 
 
@@ -439,7 +439,7 @@ def test_the_pace_counts_what_follows_the_stage():
     for done in (10, 50):
         pace.time(done, 1, 0, 5.0)
     assert pace.left(50).total_seconds() == 82  # 1,350 iterations of 50 ms, and 3 programs of 5 s.
-    assert pace.due_forecast(50) == "50 ms an iteration, about 0:01:22 left"
+    assert pace.forecast_at(50) == "50 ms an iteration, about 0:01:22 left"
 
 
 def test_a_run_is_forecast_with_its_later_stages_and_its_evaluation():

@@ -34,7 +34,7 @@ def test_the_next_step_is_the_one_that_adam_would_have_taken(result):
     """Its formula in float64, with the moments and the count of the checkpoint and the rates at the stage's end."""
     state = result.checkpoint.state
     further = dataclasses.replace(SYSTEM, more=(5,))
-    run = StageRun(SCENE, further, 2, resume=result.checkpoint)
+    run = StageRun(SCENE, further, 2, result.checkpoint)
     before = jax.device_get(run.state)
     jax.tree.map(np.testing.assert_array_equal, before.moments, state.moments)
     run.steps(1, 1)

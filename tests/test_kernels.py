@@ -22,11 +22,12 @@ from a2tg_jax import (
     pytree,
     render_appearance,
     render_image,
+    set_num_threads,
     static,
     textures_from_arrays,
 )
 from a2tg_jax.appearance import StaticShading
-from a2tg_jax.rasterize.kernels.native import composite as native, ffi
+from a2tg_jax.rasterize.kernels.native import composite as native
 from a2tg_jax.rasterize.splats import project_gaussians
 from a2tg_jax.rasterize.tiles import TileGrid, tile_lists, total_pairs
 from a2tg_jax.rasterize.views import render_traced
@@ -36,10 +37,10 @@ long = pytest.mark.long
 
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("dtype", quick_then_long(["float32"], ["float64"]))
-def test_lists_are_those_of_xla(monkeypatch, dtype):
+def test_lists_are_those_of_xla(monkeypatch, threads, dtype):
     monkeypatch.setattr(native, "SPLATS_PER_THREAD", 100)
     monkeypatch.setattr(native, "PAIRS_PER_THREAD", 100)
-    monkeypatch.setattr(ffi, "num_threads", lambda: 3)
+    set_num_threads(3)
     scene = draw_scene(4, num=300)
     gaussians = as_gaussians(scene, dtype)
     camera = as_camera(scene, dtype)
@@ -59,7 +60,7 @@ def test_lists_are_those_of_xla(monkeypatch, dtype):
     assert full.overflow and full.starts[-1] == 0
 
 
-def test_threads_share_the_work_and_nothing_else(monkeypatch):
+def test_threads_share_the_work_and_nothing_else(monkeypatch, threads):
     """Images are bit for bit the same as with one thread; gradients, summed by thread, are equal to rounding."""
     scene = draw_scene(3, num=60)
     gaussians = as_gaussians(scene, "float32")
@@ -79,7 +80,7 @@ def test_threads_share_the_work_and_nothing_else(monkeypatch):
     monkeypatch.setattr(native, "PAIRS_PER_THREAD", 10)
     found = []
     for num_threads in (1, 2, 3):
-        monkeypatch.setattr(ffi, "num_threads", lambda num=num_threads: num)
+        set_num_threads(num_threads)
         found.append(jax.block_until_ready(differentiate(gaussians, textures.buckets)))
     ((_, one), expected), *others = found
     for (_, many), gradients in others:

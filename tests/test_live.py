@@ -12,13 +12,23 @@ from small_files import taken_apart
 from small_models import billboards, with_row
 from test_compact import plain, textured
 
-from a2tg_jax import Gaussians2dMcmc, History, Mcmc, Model, Session, allocate_appearance, fit_stage, synthetic_scene
+from a2tg_jax import (
+    Gaussians2dMcmc,
+    History,
+    LossConfig,
+    Mcmc,
+    Model,
+    Session,
+    allocate_appearance,
+    fit_stage,
+    synthetic_scene,
+)
 from a2tg_jax.results.run_training import unseen
 from a2tg_jax.results.viewing import LiveView, shown_live
 from a2tg_jax.web.server import Door, application
 
 SCENE = synthetic_scene(num_views=4, width=24, height=16, num_points=40)
-SYSTEM = Gaussians2dMcmc(stage1_iterations=24, densify=Mcmc(cap=50))
+SYSTEM = Gaussians2dMcmc(stage1_iterations=24, densify=Mcmc(cap=50), sh_degree=0, loss=LossConfig(ssim_weight=0.0))
 
 
 class Clock:

@@ -16,10 +16,11 @@ from a2tg_jax import (
     init_from_points,
     normal_consistency,
     photometric_loss,
+    set_num_threads,
     value_and_grad,
 )
 from a2tg_jax.rasterize.kernels import platforms, window_scores
-from a2tg_jax.rasterize.kernels.native import ffi, ssim as kernel
+from a2tg_jax.rasterize.kernels.native import ssim as kernel
 from a2tg_jax.rasterize.kernels.score import Score
 from a2tg_jax.training.losses import mean_ssim
 
@@ -171,10 +172,10 @@ def test_regularisers_see_live_rows_only():
 
 @pytest.mark.parametrize("shape", [(11, 18), (40, 51), (90, 333)])
 @pytest.mark.parametrize(("dtype", "rtol"), [(np.float64, 1e-10), (np.float32, 2e-3)])
-def test_ssim_and_its_gradients_are_the_same_without_native_loops(monkeypatch, x64, shape, dtype, rtol):
+def test_ssim_and_its_gradients_are_the_same_without_native_loops(monkeypatch, threads, x64, shape, dtype, rtol):
     """In float32 the variances, differences of means of about 0.3, keep four digits where they are about 0.01."""
     monkeypatch.setattr(kernel, "LEAST_PIXELS", 500)
-    monkeypatch.setattr(ffi, "num_threads", lambda: 2)
+    set_num_threads(2)
     image, target = map(jnp.asarray, random_pair(*shape, 0.1, dtype))
     value, gradients = jax.value_and_grad(mean_ssim, argnums=(0, 1))(image, target)
     jax.clear_caches()

@@ -24,7 +24,9 @@ from run_folders import create_run, some_result
 from a2tg_jax import (
     Change,
     DivergedError,
+    Gaussians,
     Gaussians2dMcmc,
+    LossConfig,
     Mcmc,
     StepEvent,
     fit,
@@ -40,20 +42,21 @@ from a2tg_jax.cli import main as cli
 from a2tg_jax.host.errors import error_text
 from a2tg_jax.results import compression, run_evaluation, run_training, stage_training
 from a2tg_jax.results.folder import OLD, RunFolder, old_run, opened, put_back_old, set_aside
+from a2tg_jax.results.model_source import open_source
 from a2tg_jax.results.output_paths import check_apart
 from a2tg_jax.results.record import RunRecord, SceneSource, read_record, read_run_file, write_record
 from a2tg_jax.results.run_training import RunOptions, train_run
 from a2tg_jax.training.batches import BatchOrder
 from a2tg_jax.training.loop import StageRun
 
-SIZES = {"initial_gaussians": 60, "densify": Mcmc(cap=60)}
+SIZES = {"initial_gaussians": 60, "densify": Mcmc(cap=60), "loss": LossConfig(ssim_weight=0.0)}
 SOURCE = SceneSource("synthetic", downscale=6)
 RECORD = RunRecord(SOURCE, "gaussians-2d-mcmc", Gaussians2dMcmc(stage1_iterations=20, **SIZES))
 NAME = "gaussians-2d-mcmc-gaussians"
 QUIET = RunOptions(progress=False)
 TRAIN = [
     *("train", "synthetic", "--system", "gaussians-2d-mcmc", "--downscale", "6", "--stage1-iterations", "20"),
-    *("--initial-gaussians", "60", "--densify.cap", "60"),
+    *("--initial-gaussians", "60", "--densify.cap", "60", "--loss.ssim-weight", "0"),
 ]
 
 
@@ -196,7 +199,7 @@ def test_the_error_of_a_full_disk_names_the_file(tmp_path, monkeypatch, capsys, 
             file.write(b"x")
 
     monkeypatch.setattr(cli.command_class("info"), "run", write)
-    assert cli.main(["info", "run"]) == 2
+    assert cli.main(["info", "."]) == 2
     where = rf"{tmp_path / 'x.npz'}: the disk is full( or has no inodes left)?, \d+\.\d MB are free"
     printed = where if is_ours else "the disk is full"
     error = capsys.readouterr().err
@@ -477,7 +480,7 @@ def test_restoring_has_an_end(scene, tmp_path):
 def test_a_signal_outside_training_ends_with_one_line(monkeypatch, capsys, number, code):
     monkeypatch.setattr(cli.command_class("info"), "run", lambda self: os.kill(os.getpid(), number))
     before = signal.getsignal(number)
-    assert cli.main(["info", "run"]) == code
+    assert cli.main(["info", "."]) == code
     assert capsys.readouterr().err == "a2tg: interrupted\n" and signal.getsignal(number) == before
 
 
@@ -499,7 +502,7 @@ def test_a_signal_in_training_keeps_its_state(scene, stopped, tmp_path, monkeypa
     printed = capsys.readouterr().err.splitlines()[-1]
     assert printed == (
         f"a2tg: interrupted; the last checkpoint is {run.checkpoint(NAME, 7)}; "
-        f"continue with: a2tg train --out {out} --resume"
+        f"show it with: a2tg view {out} --model {NAME}; continue with: a2tg train --out {out} --resume"
     )
     train_run(run, scene, QUIET)
     assert_same(run, stopped[1])
@@ -548,14 +551,14 @@ def test_a_lack_of_memory_in_training_comes_with_advice(tmp_path, monkeypatch, c
 def test_a_lack_of_memory_outside_training_is_one_line(name, advice, monkeypatch, capsys):
     for printed, error in LACKS.items():
         monkeypatch.setattr(cli.command_class(name), "run", raising(error))
-        assert cli.main([name, "run"]) == 2
+        assert cli.main([name, "."]) == 2
         assert f"a2tg: error: {printed}{advice}" in capsys.readouterr().err
 
 
 def test_an_internal_error_is_not_reported_as_a_mistake_of_the_user(monkeypatch):
     monkeypatch.setattr(cli.command_class("info"), "run", raising(jax.errors.JaxRuntimeError("INTERNAL: a bug")))
     with pytest.raises(jax.errors.JaxRuntimeError, match="a bug"):
-        cli.main(["info", "run"])
+        cli.main(["info", "."])
 
 
 def test_a_run_with_a_file_budget_ends_with_its_file(tmp_path, monkeypatch, capsys):
@@ -673,6 +676,77 @@ def test_a_finished_run_is_trained_on(tmp_path, monkeypatch, capsys):
     run.state(names[2]).write_bytes(b"damaged")
     assert cli.main(resuming) == 2
     assert "delete it to train gaussians-2d-mcmc-more-3 without Adam's moments" in capsys.readouterr().err
+
+
+MORE = "gaussians-2d-mcmc-more"
+
+
+def test_further_training_that_is_interrupted_keeps_the_finished_model(tmp_path, monkeypatch, capsys):
+    """Commands take it by default, and say so; the interruption changes nothing of what comes out."""
+    monkeypatch.setattr(run_training, "evaluate_run", lambda *_, **__: some_result())
+    run, whole = RunFolder(tmp_path / "run"), RunFolder(tmp_path / "whole")
+    assert cli.main([*TRAIN, "--out", str(run.path), "--quiet"]) == 0
+    shutil.copytree(run.path, whole.path)
+    more = ["train", "--out", str(run.path), "--resume", "--quiet"]
+    assert cli.main([*more[:2], str(whole.path), *more[3:], "--more", "9"]) == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(stage_training, "save_checkpoint", saving_until(6))
+        assert cli.main([*more, "--more", "9"]) == 130
+    assert f"show it with: a2tg view {run.path} --model {MORE}; continue with" in capsys.readouterr().err
+    with pytest.warns(UserWarning, match=f"{MORE} is not finished: this is {NAME}, the last finished model; `model`"):
+        assert open_source(run.path).path == run.model(NAME)
+    with pytest.warns(UserWarning, match=f"{MORE} is not finished: this is its checkpoint after iteration 6 of 9"):
+        further = open_source(run.path, MORE)
+    assert_same_bits(further.model, load_checkpoint(run.checkpoint(MORE, 6)).model_in(SOURCE.load()))
+    assert cli.main(["info", str(run.path)]) == 0
+    printed = capsys.readouterr().out
+    assert re.search(rf"{MORE} +after iteration 6 of 9; 60 Gaussians", printed)
+    assert f"shown    {NAME}, unless" in printed
+    assert cli.main(more) == 0
+    assert_same_bits(load_model(run.model(MORE)), load_model(whole.model(MORE)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert open_source(run.path).path == run.model(MORE)
+
+
+@pytest.mark.filterwarnings("default:.*is not finished")
+def test_a_checkpoint_is_a_model_for_every_command(scene, stopped, tmp_path, capsys):
+    run = RunFolder(shutil.copytree(stopped[0].path, tmp_path / "run"))
+    newest = run.checkpoints(NAME)[-1]
+    checkpoint = load_checkpoint(newest)
+    note = f"{NAME} is not finished: this is its checkpoint after iteration {checkpoint.iteration} of 20"
+    with pytest.warns(UserWarning, match=note):
+        source = open_source(run.path)
+    assert source.path == newest and source.note == note
+    for field in dataclasses.fields(Gaussians):
+        shown, kept = (getattr(model.gaussians, field.name) for model in (source.model, checkpoint.model))
+        np.testing.assert_array_equal(shown, kept)
+    assert source.model.origin.names == scene.origin.names and source.load_scene().name == scene.name
+    commands = {
+        "render": ["--path", "test", "--size", "16x12", "--out", "frames"],
+        "export": ["--web", "page.html"],
+        "convert": ["scene.ply"],
+        "edit": ["--out", "edited.npz", "--background", "white"],
+        "eval": [],
+    }
+    for name, options in commands.items():
+        words = [str(tmp_path / word) if Path(word).suffix or word == "frames" else word for word in options]
+        assert cli.main([name, str(run.path), *words]) == 0
+        assert note in "".join(capsys.readouterr())
+    assert len(list((tmp_path / "frames").glob("*.png"))) == len(scene.test)
+    assert (tmp_path / "page.html").is_file() and (tmp_path / "scene.ply").is_file()
+    assert load_model(tmp_path / "edited.npz").background == (1.0, 1.0, 1.0)
+    assert note in run.report.read_text() and list(json.loads(run.metrics.read_text())["models"]) == [NAME]
+    # Afterwards the training continues as if nothing had been looked at.
+    train_run(run, scene, QUIET)
+    assert_same(run, stopped[1])
+
+
+def test_a_checkpoint_needs_the_cameras_of_its_scene(stopped, tmp_path):
+    run = RunFolder(shutil.copytree(stopped[0].path, tmp_path / "run"))
+    write_record(run, dataclasses.replace(read_record(run), scene=SceneSource(str(tmp_path / "nowhere"))))
+    with pytest.raises(FileNotFoundError, match="no cameras, and the scene that has them is missing"):
+        open_source(run.path)
 
 
 def test_the_next_stage_needs_the_views_of_the_one_before(tmp_path):

@@ -226,14 +226,6 @@ def test_quotas_of_control_groups(tmp_path, name):
     assert control_groups.cpu_quota(tmp_path / "nowhere") == math.inf
 
 
-@pytest.fixture
-def threads(monkeypatch):
-    """Neither `set_num_threads` nor the environment has set a number of threads."""
-    monkeypatch.delenv("A2TG_NUM_THREADS", raising=False)
-    yield
-    a2tg_jax.set_num_threads(None)
-
-
 @pytest.mark.parametrize(("quota", "expected"), [(0.2, 1), (1.5, 2), (3.0, 3), (99.0, 8), (math.inf, 8)])
 def test_the_default_is_what_the_process_may_use(monkeypatch, threads, quota, expected):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(8), raising=False)

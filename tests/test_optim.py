@@ -10,7 +10,8 @@ from small_models import some_gaussians
 
 import a2tg_jax as a2tg
 from a2tg_jax import adam_init, adam_update, exponential_decay
-from a2tg_jax.training.step import initial_state, optimized
+from a2tg_jax.training.start import initial_state
+from a2tg_jax.training.step import optimized
 
 
 def oracle_adam(param, grads, rate, b1=0.9, b2=0.999, eps=1e-15):

@@ -107,6 +107,8 @@ def ring(num: int = 12, rolled: float = 0.0) -> list[Camera]:
 
 
 def test_a_turntable_is_a_level_closed_loop_around_the_subject():
+    with pytest.raises(ValueError, match="up must be 3 numbers of unit length"):
+        turntable(ring(), 2, (0, 0, 2))
     orbit = turntable(ring(rolled=0.05), 36)
     viewmats = np.array([camera.viewmat for camera in orbit], np.float64)
     centers = centers_of(viewmats)

@@ -16,12 +16,14 @@ from PIL import Image
 from small_values import assert_same
 from test_data_transforms import write_points
 
-from a2tg_jax import Gaussians2dMcmc, Mcmc, Picture, fit, load_scene, synthetic_scene
+from a2tg_jax import Gaussians2dMcmc, LossConfig, Mcmc, Picture, fit, load_scene, synthetic_scene
 from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.training import batches, loop
 from a2tg_jax.training.batches import Ahead, BatchOrder, PhotoStore
 
-SYSTEM = Gaussians2dMcmc(stage1_iterations=12, initial_gaussians=60, densify=Mcmc(cap=70))
+SYSTEM = Gaussians2dMcmc(
+    stage1_iterations=12, initial_gaussians=60, densify=Mcmc(cap=70), sh_degree=0, loss=LossConfig(ssim_weight=0.0)
+)
 KINDS = {
     "as in their files": {},
     "smaller": {"downscale": 2},

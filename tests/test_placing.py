@@ -54,7 +54,7 @@ def seen(picture: np.ndarray, mask: np.ndarray | None = None) -> View:
 
 
 def placed(views: list[View], num: int = 20, background: tuple = (0, 0, 0)) -> a2tg.Gaussians:
-    return gaussians_at_errors(wall(), views, background, num, np.random.default_rng(0))
+    return gaussians_at_errors(wall(), Due(views=views, background=background), num)
 
 
 def columns_of(gaussians: a2tg.Gaussians) -> np.ndarray:
@@ -101,7 +101,7 @@ def test_what_masks_leave_out_and_what_shows_no_surface_gets_none():
     faint = dataclasses.replace(model.gaussians, logit_opacities=jnp.full(model.gaussians.num, -1.0))
     views = [seen(photograph(5, 8, (0, 0, 255)))]
     model = dataclasses.replace(model, gaussians=faint)
-    found = gaussians_at_errors(model, views, (0, 0, 0), 20, np.random.default_rng(0))
+    found = gaussians_at_errors(model, Due(views=views), 20)
     assert found.num == 0, "an alpha of 0.27"
 
 

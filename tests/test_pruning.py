@@ -27,12 +27,12 @@ def test_weights_are_those_of_the_oracle(seed):
     expected = oracle.render(scene).weights.sum(axis=(1, 2))
     model = Model(as_gaussians(scene, "float64"))
     camera = as_camera(scene, "float64")
-    once = shown_in(model, [seen_from(camera)]).weights
+    once = shown_in(model, Due(views=[seen_from(camera)])).weights
     np.testing.assert_allclose(once, expected, rtol=1e-9, atol=1e-9)
     assert (expected > 1).sum() > 3
     # Pixels that a mask leaves out do not count, in one view of two.
     mask = np.random.default_rng(seed).random((scene.height, scene.width)) < 0.5
-    masked = shown_in(model, [seen_from(camera, mask), seen_from(camera)]).weights
+    masked = shown_in(model, Due(views=[seen_from(camera, mask), seen_from(camera)])).weights
     shown = (oracle.render(scene).weights * mask).sum(axis=(1, 2))
     np.testing.assert_allclose(masked, shown + expected, rtol=1e-9, atol=1e-9)
 
@@ -42,11 +42,11 @@ def test_weights_are_summed_over_views_of_any_size():
     model = Model(some_state()[0].gaussians)
     camera = a2tg.synthetic_scene(num_views=3, width=24, height=16).train[0].camera
     views = [seen_from(one) for one in (camera, dataclasses.replace(camera, width=20, height=10), camera)]
-    parts = [shown_in(model, [view]).weights for view in views]
-    np.testing.assert_allclose(shown_in(model, views).weights, sum(parts), rtol=1e-6)
+    parts = [shown_in(model, Due(views=[view])).weights for view in views]
+    np.testing.assert_allclose(shown_in(model, Due(views=views)).weights, sum(parts), rtol=1e-6)
     with pytest.raises(ValueError, match="at least one view"):
-        _ = shown_in(model, [])
-    assert shown_in(Model(model.gaussians[:0]), views).weights.shape == (0,)
+        _ = shown_in(model, Due(views=[]))
+    assert shown_in(Model(model.gaussians[:0]), Due(views=views)).weights.shape == (0,)
 
 
 def seen_from(camera, mask=None) -> View:
@@ -70,7 +70,7 @@ def pruned(event: Prune):
 
 def test_those_that_show_least_go_and_all_of_a_gaussian_moves_along():
     model, camera, statistics, change = pruned(Prune(share=0.9))
-    weights = shown_in(model, [seen_from(camera)]).weights
+    weights = shown_in(model, Due(views=[seen_from(camera)])).weights
     left = int(change.model.num_live)
     assert left == model.num - round(0.9 * model.num)
     kept = change.rows[:left]

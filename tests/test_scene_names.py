@@ -10,6 +10,7 @@ from PIL import Image
 from test_data_transforms import (
     FOCAL,
     HEIGHT,
+    NAMES,
     SIZE,
     WIDTH,
     check_dots,
@@ -20,7 +21,6 @@ from test_data_transforms import (
 )
 
 from a2tg_jax import load_scene
-from a2tg_jax.data.image_files import find_image, inside, on_disk
 
 KEPT = 5
 """Rows at the top that masks exclude."""
@@ -79,22 +79,47 @@ def test_a_frame_is_removed_as_the_error_says(tmp_path):
     check_dots(load_scene(tmp_path))
 
 
+def first_called(folder, name):
+    """Loads a scene whose first frame has a name, and returns the name of its view."""
+    contents = json.loads((folder / "transforms.json").read_text())
+    contents["frames"][0]["file_path"] = name
+    (folder / "transforms.json").write_text(json.dumps(contents))
+    scene = load_scene(folder, test_every=0)
+    (own,) = {view.name for view in scene.train} - set(NAMES)
+    return own
+
+
+@pytest.fixture
+def scene_with(tmp_path):
+    """A scene whose first photograph is in another file."""
+
+    def written(file):
+        folder = tmp_path / "scene"
+        folder.mkdir()
+        write_scene(folder)
+        (folder / file).parent.mkdir(exist_ok=True)
+        (folder / NAMES[0]).rename(folder / file)
+        return folder
+
+    return written
+
+
 @pytest.mark.parametrize(
-    ("name", "expected"),
+    ("file", "name"),
     [
-        ("a/b.png", "a/b.png"),
-        ("./a//b.png", "a/b.png"),
-        ("a\\b.png", "a/b.png"),
-        (".\\a\\b.png", "a/b.png"),
-        ("{folder}/a/b.png", "a/b.png"),
-        ("{link}/a/b.png", "a/b.png"),
+        ("a/b.png", "./a//b.png"),
+        ("a/b.png", "a\\b.png"),
+        ("a/b.png", ".\\a\\b.png"),
+        ("a/b.png", "{folder}/a/b.png"),
+        ("a/b.png", "{link}/a/b.png"),
         ("1:30.png", "1:30.png"),
+        pytest.param("a\\b.png", "a\\b.png", marks=pytest.mark.skipif(os.sep == "\\", reason="separates folders")),
     ],
 )
-def test_names_inside(tmp_path, name, expected):
-    (tmp_path / "scene").mkdir()
-    (tmp_path / "link").symlink_to(tmp_path / "scene")
-    assert inside(tmp_path / "link", name.format(folder=tmp_path / "scene", link=tmp_path / "link")) == expected
+def test_names_inside(scene_with, tmp_path, file, name):
+    folder = scene_with(file)
+    (tmp_path / "link").symlink_to(folder)
+    assert first_called(tmp_path / "link", name.format(folder=folder, link=tmp_path / "link")) == file
 
 
 LEADING_OUT = [
@@ -103,21 +128,15 @@ LEADING_OUT = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("name", LEADING_OUT)
-def test_names_that_lead_out(tmp_path, name):
+def test_names_that_lead_out(scene_with, tmp_path):
+    folder = scene_with("a/b.png")
     (tmp_path / "x.png").touch()
-    with pytest.raises(ValueError, match=r"leads out of the scene's folder|too long a name \(5000 letters\)"):
-        find_image(tmp_path / "scene", name.format(folder=tmp_path / "scene"))
+    for name in LEADING_OUT:
+        with pytest.raises(ValueError, match=r"leads out of the scene's folder|too long a name \(5000 letters\)"):
+            first_called(folder, name.format(folder=folder))
 
 
-@pytest.mark.skipif(os.sep == "\\", reason="separates folders")
-def test_a_backslash_in_the_name_of_a_file(tmp_path):
-    (tmp_path / "a\\b.png").touch()
-    assert inside(tmp_path, "a\\b.png") == "a\\b.png" and on_disk(tmp_path, "a\\b.png") is not None
-
-
-def test_accents_as_letters_of_their_own(tmp_path):
+def test_accents_as_letters_of_their_own(scene_with):
     """As macOS writes them, and models made elsewhere do not."""
-    file = tmp_path / unicodedata.normalize("NFD", "Küche.jpg")
-    file.touch()
-    assert on_disk(tmp_path, unicodedata.normalize("NFC", "Küche.jpg")).samefile(file)
+    folder = scene_with(unicodedata.normalize("NFD", "Küche.png"))
+    assert unicodedata.normalize("NFC", first_called(folder, unicodedata.normalize("NFC", "Küche.png"))) == "Küche.png"

@@ -143,8 +143,9 @@ def test_shapes_of_earlier_runs_change_nothing(scene, tmp_path, request):
     """Textures grow in buckets with the room of another run's textures, one of them for a size that nobody has here."""
     if passes_in_its_own_process(request):
         return
-    start = initial_model(scene, CONFIG)
-    whole = fit_stage(scene, CONFIG, 1, start)
+    system = dataclasses.replace(CONFIG, sh_degree=0, texture=Upscale(at=(0.5,)))
+    start = initial_model(scene, system)
+    whole = fit_stage(scene, system, 1, start)
     textures = whole.model.textures
     session = Session()
     capacities = (*(len(bucket) + 2 for bucket in textures.buckets), 1)
@@ -157,9 +158,9 @@ def test_shapes_of_earlier_runs_change_nothing(scene, tmp_path, request):
             save_checkpoint(path, checkpoint)
             rooms.append(tuple(map(len, checkpoint.state.model.textures.buckets)))
 
-    assert_same(fit_stage(scene, CONFIG, 1, start, on_checkpoint=keep, checkpoint_every=8, session=session), whole)
+    assert_same(fit_stage(scene, system, 1, start, on_checkpoint=keep, checkpoint_every=8, session=session), whole)
     assert rooms == [capacities]
-    assert_same(fit_stage(scene, CONFIG, 1, resume=load_checkpoint(path), session=session), whole)
+    assert_same(fit_stage(scene, system, 1, resume=load_checkpoint(path), session=session), whole)
 
 
 @pytree

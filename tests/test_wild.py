@@ -14,8 +14,8 @@ import a2tg_jax as a2tg
 from a2tg_jax import BilateralGrid, Due, Geometry, LossConfig, adam_init
 from a2tg_jax.data.photo_reading import find_depths, read_depths
 from a2tg_jax.densify.pruning import shown_in
+from a2tg_jax.results.run_evaluation import learned_corrections
 from a2tg_jax.training.batches import stack_views
-from a2tg_jax.training.corrections import learned
 from a2tg_jax.training.start import initial_model
 from a2tg_jax.training.terms import inliers, scale_and_shift
 
@@ -149,7 +149,7 @@ class TestBilateralGrid:
         grids = origin.corrections["bilateral_grid"]
         assert grids.shape == (5, 2, 4, 4, 3, 4)
         assert np.abs(grids[: len(scene.train)] - np.eye(3, 4)).max() > 1e-4
-        assert all(set(found) == {"exposure"} for found in learned(origin).values())
+        assert all(set(found) == {"exposure"} for found in learned_corrections(origin).values())
 
 
 def depth_term(kind="inverse"):
@@ -275,8 +275,8 @@ class TestFloaters:
         picture = np.zeros((camera.height, camera.width, 3), np.uint8)
         turned = dataclasses.replace(camera, viewmat=camera.viewmat.at[0, 3].add(0.7))
         views = [a2tg.View(str(index), each, picture) for index, each in enumerate((camera, turned))]
-        found = shown_in(model, views, least=2.0)
-        alone = [shown_in(model, [view]).weights for view in views]
+        found = shown_in(model, Due(views=views), least=2.0)
+        alone = [shown_in(model, Due(views=[view])).weights for view in views]
         np.testing.assert_array_equal(found.num_views, sum(weights >= 2.0 for weights in alone))
         assert len(set(found.num_views.tolist())) > 1
         change = a2tg.PruneFloaters(min_views=2, least=2.0).apply(

@@ -183,8 +183,8 @@ class Appearance(NamedFields):
         rates = {}
         for name in names:
             part = getattr(self, name)
-            own_rate = rate.get(name, 0.0)
-            rates[name] = part.rates(own_rate) if isinstance(part, Part) else own_rate
+            rate_of_part = rate.get(name, 0.0)
+            rates[name] = part.rates(rate_of_part) if isinstance(part, Part) else rate_of_part
         return dataclasses.replace(self, **rates)
 
     def opacities(self, gaussians: Gaussians) -> Array:
@@ -307,7 +307,7 @@ def array_fields(node: Any) -> list[str]:
     return [field.name for field in dataclasses.fields(node) if not field.metadata.get("static")]
 
 
-def own_fields(appearance: Any) -> list[str]:
+def added_fields(appearance: Any) -> list[str]:
     """Return the names of the array fields that a subclass adds."""
     inherited = {field.name for field in dataclasses.fields(Appearance)}
     return [name for name in array_fields(appearance) if name not in inherited]
@@ -463,7 +463,7 @@ def check_appearance(appearance: Appearance, gaussians: Gaussians) -> None:
 
 def check_arrays_given(appearance: Appearance) -> None:
     """Raise ValueError if a subclass or a part is a template without its arrays."""
-    added = own_fields(appearance)
+    added = added_fields(appearance)
     missing = added[:1] if all(getattr(appearance, name) is None for name in added) else []
     for name, part in _parts_of(appearance).items():
         missing += [f"{name}.{field}" for field in array_fields(part) if getattr(part, field) is None]

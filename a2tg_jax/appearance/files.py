@@ -12,8 +12,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
-from a2tg_jax.appearance.base import Appearance, allocate_appearance, own_fields
+from a2tg_jax.appearance.base import Appearance, added_fields, allocate_appearance
 from a2tg_jax.appearance.parts import (
     MAX_DEGREE,
     Bands,
@@ -23,6 +24,7 @@ from a2tg_jax.appearance.parts import (
     degrees_of_sizes,
     dense_bands,
 )
+from a2tg_jax.base.checks import Wanted, check_shape
 from a2tg_jax.core.gaussians import no_rows
 from a2tg_jax.core.pytree import is_shared
 from a2tg_jax.core.sh import NUM_BASES
@@ -50,7 +52,7 @@ def arrays_of(appearance: Appearance, sh_degree: int) -> dict[str, np.ndarray]:
     if appearance.texture is not None and appearance.texture.texels is not None:
         textures = appearance.texture.texels
         arrays |= {"sizes": textures.sizes, "texels": textures.flat()}
-    for field in own_fields(appearance):
+    for field in added_fields(appearance):
         for path, leaf in jax.tree_util.tree_leaves_with_path(getattr(appearance, field), is_leaf=is_table):
             name = field + jax.tree_util.keystr(path)
             if isinstance(leaf, Table):
@@ -76,28 +78,24 @@ def with_arrays(template: Appearance, arrays: Mapping[str, np.ndarray], sh_degre
         changes["texture"] = dataclasses.replace(template.texture, texels=_textures(arrays, "sizes", "texels"))
     # Two rows are enough to learn the structure of a subclass's arrays and the shape of a row.
     example = allocate_appearance(template, jax.random.key(0), no_rows(2, 1))
-    added = own_fields(template)
+    added = added_fields(template)
 
     def read(path: Any, leaf: Any) -> Any:
         name = jax.tree_util.keystr(path).removeprefix(".")
         if path[0].name not in added:
             return leaf
         if is_shared(leaf):
-            return jax.tree_util.tree_map_with_path(lambda inner, array: read_shared((*path, *inner), array), leaf)
+            return jax.tree_util.tree_map_with_path(lambda inner, x: read_array((*path, *inner), x.shape), leaf)
         if isinstance(leaf, Table):
             if f"{name}.sizes" not in arrays:  # Version 0.2 named the pictures of billboards like textures.
                 return _textures(arrays, "sizes", "texels")
             return _textures(arrays, f"{name}.sizes", f"{name}.elements")
-        array = _array(arrays, name)
-        if array.shape[1:] != leaf.shape[1:]:
-            raise ValueError(f"{name} must be [N, …] with rows {leaf.shape[1:]}; got {array.shape}")
-        return jnp.asarray(array)
+        return read_array(path, ("N", *leaf.shape[1:]))
 
-    def read_shared(path: Any, leaf: Any) -> Any:
+    def read_array(path: Any, wanted: Wanted) -> Array:
         name = jax.tree_util.keystr(path).removeprefix(".")
         array = _array(arrays, name)
-        if array.shape != leaf.shape:
-            raise ValueError(f"{name} must be {[*leaf.shape]}, as the appearance allocates it; got {[*array.shape]}")
+        check_shape(name, array, wanted)
         return jnp.asarray(array)
 
     filled = jax.tree_util.tree_map_with_path(read, example, is_leaf=is_whole)

@@ -46,8 +46,8 @@ def defaulting_to(text: str, metavar: str | None = None) -> Any:
 
 LastModel = Annotated[
     str | None,
-    arg(help="Name of a run's model, as a2tg info prints it."),
-    defaulting_to("the last model of the main system", "NAME"),
+    arg(help="Name of a run's model, as a2tg info prints it; of an unfinished stage, its newest checkpoint."),
+    defaulting_to("the last finished model of the main system, or else the newest checkpoint", "NAME"),
 ]
 RunFolderPath = Annotated[Positional[Path], arg(metavar="RUN", help="Run folder.")]
 RunOrFile = Annotated[

@@ -16,8 +16,7 @@ from a2tg_jax.results.folder import RunFolder, opened
 from a2tg_jax.results.record import RunRecord
 from a2tg_jax.results.report import RunResult, sizes_line, summary_text
 from a2tg_jax.results.run_training import RunOptions, begin_run, resume_run, warn
-from a2tg_jax.results.viewing import shown_live
-from a2tg_jax.training.loop import Watch
+from a2tg_jax.results.viewing import LiveView, shown_live
 
 DEMO_SYSTEM = A2tg(
     stage1_iterations=400,
@@ -103,7 +102,7 @@ def print_result(result: RunResult, folder: Path) -> None:
     print(f"{summary_text(result)}\n{sizes_line(run, result)}\nreport: {run.report}")
 
 
-def in_browser(scene: Scene) -> AbstractContextManager[Watch]:
+def in_browser(scene: Scene) -> AbstractContextManager[LiveView]:
     """Show the training of a scene in a browser."""
 
     def started(address: str) -> None:

@@ -221,7 +221,7 @@ def back_project(depth: Array, camera: Camera) -> Array:
       camera: the view, of that size.
 
     Returns:
-      Points [H, W, 3]; those of pixels without a ray have no meaning.
+      Points [H, W, 3], without meaning where a pixel has no ray.
     """
     height, width = depth.shape
     x, y = jnp.meshgrid(jnp.arange(width, dtype=depth.dtype) + 0.5, jnp.arange(height, dtype=depth.dtype) + 0.5)

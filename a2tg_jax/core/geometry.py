@@ -27,16 +27,6 @@ Box = tuple[Array, Array, Array, Array]
 Floats = Array | np.ndarray
 
 
-def fibonacci(num: int, turn: float = 0.0) -> np.ndarray:
-    """Return unit vectors [num, 3] spread evenly over the sphere, a Fibonacci lattice, turned by radians about z."""
-    index = np.arange(num) + 0.5
-    z = 1 - 2 * index / num
-    # π·(1 + √5) is 2π times the golden ratio.
-    angle = np.pi * (1 + 5**0.5) * index + turn
-    across = np.sqrt(1 - z * z)
-    return np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)
-
-
 def pixel_sizes(means: Floats, scales: Floats, viewmat: Floats, K: Floats) -> Floats:
     """Return the smaller standard deviation of Gaussians in pixels [N], of NumPy or JAX; 0 at depths up to the near
     plane."""

@@ -6,7 +6,6 @@ programs computed.
 
 import functools
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,15 +17,6 @@ Integer = Array | int
 """An integer, traced or not."""
 MOST_DIFFERENCE = 1e-3
 """Largest `relative_difference` that counts as rounding of float32."""
-
-
-def evenly_chosen(items: Any, most: int) -> Any:
-    """Return at most `most` items of a list, a tuple or an array, evenly spaced from the first to the last one; 1: the
-    first."""
-    if len(items) <= most:
-        return items
-    chosen = np.linspace(0, len(items) - 1, most).round().astype(int)
-    return items[chosen] if isinstance(items, np.ndarray | Array) else [items[index] for index in chosen]
 
 
 def relative_difference(results: Sequence[ArrayLike], references: Sequence[ArrayLike]) -> float:

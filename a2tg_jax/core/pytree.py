@@ -101,9 +101,9 @@ def pytree(cls: Any = None, /, **options: Any) -> Any:
     """
     if cls is None:
         return lambda decorated: pytree(decorated, **options)
-    own_equality = vars(cls).get("__eq__", _are_equal)
+    equality = vars(cls).get("__eq__", _are_equal)
     made = dataclasses.dataclass(frozen=True, **options)(cls)
-    made.__eq__ = own_equality
+    made.__eq__ = equality
     _name_replace(made)
     fields = dataclasses.fields(made)
     fixed = tuple(field.name for field in fields if field.metadata.get("static"))

@@ -12,10 +12,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from a2tg_jax.base.checks import LARGEST_NUMBER, check_array, check_kind, check_shape
+from a2tg_jax.base.even_spacing import fibonacci
 from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.core.cameras import MAX_SKEW
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
-from a2tg_jax.core.geometry import fibonacci
 from a2tg_jax.core.sh import sh_basis
 
 

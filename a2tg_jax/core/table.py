@@ -390,8 +390,8 @@ def resize(
 
 
 def _rebuilt(old: TableT, sources: _Indices, ids: np.ndarray, places: Places, padding: Sequence[float]) -> TableT:
-    """Return a table with the blocks of the old one that are at (bucket, row) [n], resized, as those of the Gaussians
-    `ids` [n]; other Gaussians have padding."""
+    """Return a table in which the Gaussians `ids` [n] have the old table's blocks at (bucket, row) [n], resized; other
+    Gaussians have padding."""
     buckets = _filled(places.layout, padding, old._dtype)
     old_bucket, old_row = sources
     new_bucket = np.asarray(places.bucket)[ids]

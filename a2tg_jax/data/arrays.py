@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike
 
 from a2tg_jax import DepthMap, Mask, Picture, Scene
 from a2tg_jax.base.checks import check_kind, check_shape, check_unmasked, described, kind_of
+from a2tg_jax.base.even_spacing import evenly_chosen
 from a2tg_jax.core.cameras import check_intrinsics
-from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.pictures import how_to_convert
 from a2tg_jax.data.assembly import (
     PointCloud,

@@ -8,16 +8,16 @@ import itertools
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from a2tg_jax import Camera, DepthMap, Mask, Picture, Scene, Similarity, View
+from a2tg_jax.base.even_spacing import evenly_chosen
 from a2tg_jax.base.text import counted, first_names, in_bytes
 from a2tg_jax.core.cameras import LARGEST_COORDINATE, MAX_SKEW, check_calibration
-from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.sight import FIRST_LOOK, Sight, unseeing
 from a2tg_jax.data.capture_geometry import (
     LEAST_FACING,
@@ -80,7 +80,7 @@ class Shot:
     depth: DepthMap | None = None
     panorama: int | None = None
 
-    def sight(self, viewmat: np.ndarray) -> "Sight":
+    def sight(self, viewmat: np.ndarray) -> Sight:
         """Return what it shows from a pose [4, 4] in any world."""
         return Sight.of(viewmat, self.K, self.picture.size, self.rays)
 
@@ -125,20 +125,102 @@ def assemble_scene(
         raise ValueError(f"{source}: {error}") from None
     warn_of_rounding("camera positions", camera_centers(poses), transform, source)
     viewmats = {shot.name: transform.apply_to_viewmat(shot.viewmat) for shot in shots}
-    if cloud is not None:
-        cloud = _usable_points(cloud, transform, source)
-    points, colors = _start(train, viewmats, cloud, transform, source, is_object)
+    sights = [shot.sight(viewmats[shot.name]) for shot in train]
+    usable = None if cloud is None else _usable_points(cloud, transform, source)
+    start = None if usable is None else _seen_points(usable, train, sights, source)
+    if start is None:
+        lacks = "has no" if usable is None or len(usable.points) < 2 else "no training view sees any of its"
+        looks = _looks(train, viewmats)
+        start = _made_points(sights, looks, transform.rotation if is_object else None)
+        obstacle = _obstacle(looks) if start.is_random else ""
+        if cloud is not None or obstacle or not is_object:
+            kind = f"random points, since {obstacle}" if obstacle else "points where photographs agree"
+            warnings.warn(f"{source}: {lacks} sparse points; starts from {len(start.points):,} {kind}", stacklevel=3)
     views = [_view(shot, viewmats[shot.name]) for shot in shots]
     test_names = {shot.name for shot in test}
     return Scene(
         name=name,
         train=tuple(view for view in views if view.name not in test_names),
         test=tuple(view for view in views if view.name in test_names),
-        points=np.asarray(points, np.float32),
-        colors=colors.astype(np.float32) / np.float32(255),
+        points=np.asarray(start.points, np.float32),
+        colors=start.colors.astype(np.float32) / np.float32(255),
         transform=transform,
         scale=scene_scale(camera_centers(np.stack(list(viewmats.values()))[~is_outlying])),
     )
+
+
+def _check_shots(shots: Sequence[Shot], num_train: int, source: str) -> None:
+    """Raise ValueError if the shots, sorted by name, make no scene, or one is so far away that it moves the origin."""
+    if len(shots) < 2:
+        raise ValueError(f"{source}: has {len(shots)} view(s) with a pose; at least two are needed")
+    if num_train < 1:
+        raise ValueError(
+            f"{source}: holds out every view for testing; choose another test_every, or 0 for no test views"
+        )
+    for shot, following in itertools.pairwise(shots):
+        if shot.name == following.name:
+            raise ValueError(f"{source}: lists {shot.name} twice; remove one")
+    for shot in shots:
+        if shot.mask is not None and shot.mask.num == 0:
+            raise ValueError(
+                f"{source}: the mask of {shot.name} excludes every pixel; remove the photograph or correct the mask"
+            )
+    centers = camera_centers(np.stack([shot.viewmat for shot in shots]))
+    # Medians, because one camera far away would move a mean towards itself.
+    distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
+    farthest = int(np.argmax(distances))
+    # A median of 0, with most cameras at one place, is no unit.
+    if 0 < FARTHEST * np.median(distances) < distances[farthest]:
+        raise ValueError(
+            f"{source}: {shots[farthest].name} is more than {FARTHEST:g} times as far away as half of the cameras; "
+            "remove it from the scene or correct the pose"
+        )
+
+
+def _view(shot: Shot, viewmat: np.ndarray) -> View:
+    """Return the shot with its camera in the normalised world."""
+    height, width = shot.picture.size
+    check_calibration(viewmat, shot.K, width, height, shot.name)
+    rays: Any = shot.rays  # Views of one lens share the array.
+    camera = Camera(jnp.asarray(viewmat, jnp.float32), jnp.asarray(shot.K, jnp.float32), width, height, rays)
+    mask = shot.mask
+    if rays is not None:
+        has_ray = np.isfinite(rays).all(axis=2)
+        mask = Mask.of(has_ray if mask is None else has_ray & mask.read())
+    # Batches of views without masks carry one bool per view (scene.counted_pixels).
+    if mask is not None and mask.is_full:
+        mask = None
+    return View(shot.name, camera, shot.picture, mask, shot.depth, shot.panorama)
+
+
+# The world
+
+
+def rigid_viewmat(viewmat: np.ndarray, what: str) -> np.ndarray:
+    """Return the rigid motion nearest to a nearly rigid world-to-camera matrix [4, 4], such as a rounded pose, with the
+    same camera centre -R⁻¹·t. `what` is its name."""
+    rigid = rigid_motion(viewmat, what)
+    # In map coordinates t is millions of metres long: with another R, the same t would be another place.
+    rigid[:3, 3] = rigid[:3, :3] @ np.linalg.solve(viewmat[:3, :3], viewmat[:3, 3])
+    return rigid
+
+
+def rigid_motion(motion: np.ndarray, what: str) -> np.ndarray:
+    """Return the rigid motion nearest to a nearly rigid matrix [4, 4], with the same translation, such as the position
+    in a camera-to-world matrix. `what` is its name."""
+    rotation = motion[:3, :3]
+    if not (np.abs(motion) <= LARGEST_COORDINATE).all():  # False for NaN.
+        largest = np.abs(motion).max()
+        fault = f"exceeds ±{LARGEST_COORDINATE:g}, at {largest:g}" if np.isfinite(largest) else "is not finite"
+        raise ValueError(f"{what}: its pose {fault}; remove it from the scene or correct the pose")
+    # The nearest orthogonal matrix to R = U·S·Vᵀ is U·Vᵀ; it is a reflection if its determinant is -1.
+    left, singular_values, right = np.linalg.svd(rotation)
+    if np.abs(singular_values - 1).max() > MAX_SKEW or np.linalg.det(rotation) < 0:
+        raise ValueError(f"{what}: its pose is not a rigid motion; rotations must be orthonormal and right-handed")
+    rigid = np.eye(4)
+    rigid[:3, :3] = left @ right
+    rigid[:3, 3] = motion[:3, 3]
+    return rigid
 
 
 def _warn_of_outlying(shots: Sequence[Shot], poses: np.ndarray, cloud: PointCloud | None, source: str) -> np.ndarray:
@@ -167,8 +249,72 @@ def _warn_of_outlying(shots: Sequence[Shot], poses: np.ndarray, cloud: PointClou
     return is_outlying
 
 
+def warn_of_rounding(what: str, positions: np.ndarray, transform: Similarity, source: str) -> None:
+    """Warn if positions [..., 3] in the original world are numbers of float32, whose steps are large there.
+
+    `transform` leads to the normalised world, in which the cameras' distance is 1.
+    """
+    steps = np.spacing(np.abs(positions).astype(np.float32)).astype(np.float64)
+    is_coarse = steps * transform.scale > COARSEST
+    coarse = positions[is_coarse]
+    steps = steps[is_coarse]
+    # Positions that come from inverting a matrix differ from float32 by rounding of float64.
+    is_float32 = np.abs(coarse - coarse.astype(np.float32)) <= 1e-3 * steps
+    is_whole = np.abs(coarse - np.rint(coarse)) <= 1e-3  # Such as a grid in metres, which lost nothing.
+    if not len(coarse) or not is_float32.all() or (is_whole.all() and steps.max() < 1):
+        return
+    warnings.warn(
+        f"{source}: {what} were rounded to float32, in steps of {steps.max():g}, which is "
+        f"{steps.max() * transform.scale:.2g} of the cameras' distance from the subject: give them in float64, or "
+        "subtract an offset before they become float32",
+        stacklevel=4,
+    )
+
+
+def normalizing_similarity(viewmats: np.ndarray) -> Similarity:
+    """Return the similarity to the normalised world of rigid world-to-camera matrices [V, 4, 4].
+
+    The origin is the point nearest to all optical axes in least squares, or the mean camera centre if the axes are
+    nearly parallel. The mean camera-up becomes +z, unless the ups cancel. The median distance of the cameras from the
+    origin becomes 1.
+    """
+    centers = camera_centers(viewmats)
+    origin = subject_of(viewmats)
+    rotation = np.eye(3)
+    # The rows of R are the axes of the camera in the world; y is down.
+    up = -viewmats[:, 1, :3].mean(axis=0)
+    if np.linalg.norm(up) >= MIN_UP_LENGTH:  # The smallest rotation that turns up to +z.
+        up = up / np.linalg.norm(up)
+        axis = np.cross(up, [0.0, 0.0, 1.0])
+        sine = np.linalg.norm(axis)
+        axis = axis / sine if sine > 1e-12 else np.array([1.0, 0.0, 0.0])  # Up is z or -z: any level axis.
+        rotation = Rotation.from_rotvec(axis * np.arctan2(sine, up[2])).as_matrix()
+    zero = ZERO_SPREAD * max(float(np.linalg.norm(centers, axis=1).max()), np.finfo(np.float64).tiny)
+    spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
+    distance = float(np.median(np.linalg.norm(centers - origin, axis=1)))
+    if min(spread, distance) <= zero:
+        raise ValueError("all cameras are at one place; photographs from different positions are needed")
+    return Similarity(1.0 / distance, rotation, -rotation @ origin / distance)  # x' = R·(x - origin) / distance
+
+
+def scene_scale(centers: np.ndarray) -> float:
+    """Return 1.1 × the largest distance of a camera centre [V, 3] from their mean, the unit of the means' learning
+    rate."""
+    # As getNerfppNorm of 3DGS, whose learning rates are in this unit.
+    return 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+
+
+# Points to start from
+
+
+def are_somewhere(points: np.ndarray) -> np.ndarray:
+    """Return [P] bool, whether the coordinates of points [P, 3] are finite and not too large."""
+    return np.asarray((np.abs(points) <= LARGEST_COORDINATE).all(axis=1))  # False for NaN.
+
+
 def _usable_points(cloud: PointCloud, transform: Similarity, source: str) -> PointCloud:
-    """Return the points whose coordinates are finite and not too large; a warning counts the others."""
+    """Return the points in the normalised world whose coordinates are finite and not too large; a warning counts the
+    others."""
     is_usable = are_somewhere(cloud.points)
     # Again in the normalised world: its unit is small if the cameras are close together.
     is_usable[is_usable] = are_somewhere(transform.apply(cloud.points[is_usable]))
@@ -176,70 +322,48 @@ def _usable_points(cloud: PointCloud, transform: Similarity, source: str) -> Poi
         left_out = counted(int(np.count_nonzero(~is_usable)), "point")
         message = f"{source}: {left_out} left out, not finite or beyond ±{LARGEST_COORDINATE:g}"
         warnings.warn(message, stacklevel=4)
-        cloud = PointCloud(cloud.points[is_usable], cloud.colors[is_usable])
-    warn_of_rounding("points", cloud.points, transform, source)
+    points = cloud.points[is_usable]
+    warn_of_rounding("points", points, transform, source)
+    return PointCloud(transform.apply(points), cloud.colors[is_usable])
+
+
+def _seen_points(cloud: PointCloud, train: Sequence[Shot], sights: Sequence[Sight], source: str) -> PointCloud | None:
+    """Return points of the normalised world, with a warning that counts training views that see none, or None if no
+    view sees any."""
+    # Initial Gaussians are as large as the distances to their neighbours, so one point is not enough.
+    if len(cloud.points) < 2:
+        return None
+    blind = unseeing(cloud.points, sights)
+    if len(blind) == len(sights):
+        return None
+    if blind:
+        message = f"{source}: {len(blind)} of {len(sights)} training views see none of its points, such as "
+        warnings.warn(f"{message}{train[blind[0]].name}: nothing to start from there", stacklevel=4)
     return cloud
 
 
-def _start(
-    train: Sequence[Shot], viewmats: Mapping[str, np.ndarray], cloud: PointCloud | None, transform: Similarity,
-    source: str, is_object: bool,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Return the points [P, 3] to start from, in the normalised world, and their colours [P, 3] uint8.
+@dataclasses.dataclass(frozen=True, eq=False)
+class _MadePoints(PointCloud):
+    """Points of a scene that has none, in the normalised world."""
 
-    The cloud's points are used if training views see some. Warnings count views that see none, or say which other
-    points are used.
-    """
-    sights = [shot.sight(viewmats[shot.name]) for shot in train]
-    lacks = "has no"
-    # Initial Gaussians are as large as the distances to their neighbours, so one point is not enough.
-    if cloud is not None and len(cloud.points) > 1:
-        points = transform.apply(cloud.points)
-        blind = unseeing(points, sights)
-        if len(blind) < len(sights):
-            if blind:
-                message = f"{source}: {len(blind)} of {len(sights)} training views see none of its points, such as "
-                warnings.warn(f"{message}{train[blind[0]].name}: nothing to start from there", stacklevel=4)
-            return points, cloud.colors
-        lacks = "no training view sees any of its"
-    start = _start_without_points(train, viewmats, sights, transform.rotation if is_object else None)
-    if cloud is not None or start.obstacle or not is_object:
-        kind = f"random points, since {start.obstacle}" if start.obstacle else "points where photographs agree"
-        warnings.warn(f"{source}: {lacks} sparse points; starts from {len(start.points):,} {kind}", stacklevel=4)
-    return start.points, start.colors
+    is_random: bool
 
 
-class _MadePoints(NamedTuple):
-    """Points of a scene that has none."""
-
-    points: np.ndarray  # [P, 3]
-    colors: np.ndarray  # [P, 3] uint8
-    obstacle: str  # Why they are random; "" if photographs agree there.
-
-
-def _start_without_points(
-    train: Sequence[Shot], viewmats: Mapping[str, np.ndarray], sights: "Sequence[Sight]", object_axes: np.ndarray | None
-) -> _MadePoints:
-    """Return points where photographs agree, or random grey ones. Each view sees some."""
-    random = random_points(sights, object_axes)
-    # Photographs that validation holds out are not compared, unless there are no others.
+def _looks(train: Sequence[Shot], viewmats: Mapping[str, np.ndarray]) -> list[Look]:
+    """Return photographs to compare: not those that validation holds out, unless there are no others."""
     kept = every_kth(train, VALIDATION_EVERY)[0] or train
     compared = evenly_chosen([shot for shot in kept if shot.rays is None], MOST_VIEWS)
-    looks = [Look(shot.picture, shot.mask, viewmats[shot.name], shot.K) for shot in compared]
+    return [Look(shot.picture, shot.mask, viewmats[shot.name], shot.K) for shot in compared]
+
+
+def _made_points(sights: Sequence[Sight], looks: Sequence[Look], object_axes: np.ndarray | None) -> _MadePoints:
+    """Return points where photographs agree, or random grey ones. Each view sees some."""
+    random = random_points(sights, object_axes)
     points, colors = agreeing_points(looks, random, NUM_POINTS)
-    obstacle = ""
-    if len(points) < 2:
+    is_random = len(points) < 2
+    if is_random:
         points = random[:NUM_POINTS]
         colors = np.full(points.shape, GREY)
-        if not looks:
-            obstacle = "photographs that keep a lens's distortion are not compared"
-        elif plain_share(looks) > MOST_PLAIN:
-            obstacle = (
-                f"{plain_share(looks):.0%} of the photographs is plain, such as a wall or the sky, where they would "
-                "agree anywhere: give points of a reconstruction, such as a2tg sfm finds"
-            )
-        else:
-            obstacle = "the photographs agree nowhere"
     else:
         blind = unseeing(points, sights)
         if blind:
@@ -248,7 +372,19 @@ def _start_without_points(
             more = random_points([sights[index] for index in blind])[:num]
             points = np.concatenate([points, more])
             colors = np.concatenate([colors, np.full(more.shape, GREY)])
-    return _MadePoints(points, np.rint(255 * colors).astype(np.uint8), obstacle)
+    return _MadePoints(points, np.rint(255 * colors).astype(np.uint8), is_random)
+
+
+def _obstacle(looks: Sequence[Look]) -> str:
+    """Return why there are no points where photographs agree."""
+    if not looks:
+        return "photographs that keep a lens's distortion are not compared"
+    if plain_share(looks) > MOST_PLAIN:
+        return (
+            f"{plain_share(looks):.0%} of the photographs is plain, such as a wall or the sky, where they would agree "
+            "anywhere: give points of a reconstruction, such as a2tg sfm finds"
+        )
+    return "the photographs agree nowhere"
 
 
 def random_points(sights: Sequence[Sight], object_axes: np.ndarray | None = None) -> np.ndarray:
@@ -297,135 +433,7 @@ def random_points(sights: Sequence[Sight], object_axes: np.ndarray | None = None
     return np.concatenate([cube, offsets + centers[view]])
 
 
-def rigid_viewmat(viewmat: np.ndarray, what: str) -> np.ndarray:
-    """Return the rigid motion nearest to a nearly rigid world-to-camera matrix [4, 4], such as a rounded pose, with the
-    same camera centre -R⁻¹·t. `what` is its name."""
-    rigid = rigid_motion(viewmat, what)
-    # In map coordinates t is millions of metres long: with another R, the same t would be another place.
-    rigid[:3, 3] = rigid[:3, :3] @ np.linalg.solve(viewmat[:3, :3], viewmat[:3, 3])
-    return rigid
-
-
-def rigid_motion(motion: np.ndarray, what: str) -> np.ndarray:
-    """Return the rigid motion nearest to a nearly rigid matrix [4, 4], with the same translation, such as the position
-    in a camera-to-world matrix. `what` is its name."""
-    rotation = motion[:3, :3]
-    if not (np.abs(motion) <= LARGEST_COORDINATE).all():  # False for NaN.
-        largest = np.abs(motion).max()
-        fault = f"exceeds ±{LARGEST_COORDINATE:g}, at {largest:g}" if np.isfinite(largest) else "is not finite"
-        raise ValueError(f"{what}: its pose {fault}; remove it from the scene or correct the pose")
-    # The nearest orthogonal matrix to R = U·S·Vᵀ is U·Vᵀ; it is a reflection if its determinant is -1.
-    left, singular_values, right = np.linalg.svd(rotation)
-    if np.abs(singular_values - 1).max() > MAX_SKEW or np.linalg.det(rotation) < 0:
-        raise ValueError(f"{what}: its pose is not a rigid motion; rotations must be orthonormal and right-handed")
-    rigid = np.eye(4)
-    rigid[:3, :3] = left @ right
-    rigid[:3, 3] = motion[:3, 3]
-    return rigid
-
-
-def _check_shots(shots: Sequence[Shot], num_train: int, source: str) -> None:
-    """Raise ValueError if the shots, sorted by name, make no scene, or one is so far away that it moves the origin."""
-    if len(shots) < 2:
-        raise ValueError(f"{source}: has {len(shots)} view(s) with a pose; at least two are needed")
-    if num_train < 1:
-        raise ValueError(
-            f"{source}: holds out every view for testing; choose another test_every, or 0 for no test views"
-        )
-    for shot, following in itertools.pairwise(shots):
-        if shot.name == following.name:
-            raise ValueError(f"{source}: lists {shot.name} twice; remove one")
-    for shot in shots:
-        if shot.mask is not None and shot.mask.num == 0:
-            raise ValueError(
-                f"{source}: the mask of {shot.name} excludes every pixel; remove the photograph or correct the mask"
-            )
-    centers = camera_centers(np.stack([shot.viewmat for shot in shots]))
-    # Medians, because one camera far away would move a mean towards itself.
-    distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
-    farthest = int(np.argmax(distances))
-    # A median of 0, with most cameras at one place, is no unit.
-    if 0 < FARTHEST * np.median(distances) < distances[farthest]:
-        raise ValueError(
-            f"{source}: {shots[farthest].name} is more than {FARTHEST:g} times as far away as half of the cameras; "
-            "remove it from the scene or correct the pose"
-        )
-
-
-def are_somewhere(points: np.ndarray) -> np.ndarray:
-    """Return [P] bool, whether the coordinates of points [P, 3] are finite and not too large."""
-    return np.asarray((np.abs(points) <= LARGEST_COORDINATE).all(axis=1))  # False for NaN.
-
-
-def warn_of_rounding(what: str, positions: np.ndarray, transform: Similarity, source: str) -> None:
-    """Warn if positions [..., 3] in the original world are numbers of float32, whose steps are large there.
-
-    `transform` leads to the normalised world, in which the cameras' distance is 1.
-    """
-    steps = np.spacing(np.abs(positions).astype(np.float32)).astype(np.float64)
-    is_coarse = steps * transform.scale > COARSEST
-    coarse = positions[is_coarse]
-    steps = steps[is_coarse]
-    # Positions that come from inverting a matrix differ from float32 by rounding of float64.
-    is_float32 = np.abs(coarse - coarse.astype(np.float32)) <= 1e-3 * steps
-    is_whole = np.abs(coarse - np.rint(coarse)) <= 1e-3  # Such as a grid in metres, which lost nothing.
-    if not len(coarse) or not is_float32.all() or (is_whole.all() and steps.max() < 1):
-        return
-    warnings.warn(
-        f"{source}: {what} were rounded to float32, in steps of {steps.max():g}, which is "
-        f"{steps.max() * transform.scale:.2g} of the cameras' distance from the subject: give them in float64, or "
-        "subtract an offset before they become float32",
-        stacklevel=4,
-    )
-
-
-def _view(shot: Shot, viewmat: np.ndarray) -> View:
-    """Return the shot with its camera in the normalised world."""
-    height, width = shot.picture.size
-    check_calibration(viewmat, shot.K, width, height, shot.name)
-    rays: Any = shot.rays  # Views of one lens share the array.
-    camera = Camera(jnp.asarray(viewmat, jnp.float32), jnp.asarray(shot.K, jnp.float32), width, height, rays)
-    mask = shot.mask
-    if rays is not None:
-        has_ray = np.isfinite(rays).all(axis=2)
-        mask = Mask.of(has_ray if mask is None else has_ray & mask.read())
-    # Batches of views without masks carry one bool per view (scene.counted_pixels).
-    if mask is not None and mask.is_full:
-        mask = None
-    return View(shot.name, camera, shot.picture, mask, shot.depth, shot.panorama)
-
-
-def normalizing_similarity(viewmats: np.ndarray) -> Similarity:
-    """Return the similarity to the normalised world of rigid world-to-camera matrices [V, 4, 4].
-
-    The origin is the point nearest to all optical axes in least squares, or the mean camera centre if the axes are
-    nearly parallel. The mean camera-up becomes +z, unless the ups cancel. The median distance of the cameras from the
-    origin becomes 1.
-    """
-    centers = camera_centers(viewmats)
-    origin = subject_of(viewmats)
-    rotation = np.eye(3)
-    # The rows of R are the axes of the camera in the world; y is down.
-    up = -viewmats[:, 1, :3].mean(axis=0)
-    if np.linalg.norm(up) >= MIN_UP_LENGTH:  # The smallest rotation that turns up to +z.
-        up = up / np.linalg.norm(up)
-        axis = np.cross(up, [0.0, 0.0, 1.0])
-        sine = np.linalg.norm(axis)
-        axis = axis / sine if sine > 1e-12 else np.array([1.0, 0.0, 0.0])  # Up is z or -z: any level axis.
-        rotation = Rotation.from_rotvec(axis * np.arctan2(sine, up[2])).as_matrix()
-    zero = ZERO_SPREAD * max(float(np.linalg.norm(centers, axis=1).max()), np.finfo(np.float64).tiny)
-    spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
-    distance = float(np.median(np.linalg.norm(centers - origin, axis=1)))
-    if min(spread, distance) <= zero:
-        raise ValueError("all cameras are at one place; photographs from different positions are needed")
-    return Similarity(1.0 / distance, rotation, -rotation @ origin / distance)  # x' = R·(x - origin) / distance
-
-
-def scene_scale(centers: np.ndarray) -> float:
-    """Return 1.1 × the largest distance of a camera centre [V, 3] from their mean, the unit of the means' learning
-    rate."""
-    # As getNerfppNorm of 3DGS, whose learning rates are in this unit.
-    return 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+# Views that are held out
 
 
 Held = TypeVar("Held", Shot, View)

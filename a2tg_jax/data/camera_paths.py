@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from a2tg_jax import Camera, Origin, resize_camera
 from a2tg_jax.base.checks import check_int
-from a2tg_jax.core.cameras import check_camera, checked_cameras
+from a2tg_jax.core.cameras import MAX_SKEW, check_camera, checked_cameras
 from a2tg_jax.data.capture_geometry import (
     camera_centers,
     distance_to_subject,
@@ -41,7 +41,7 @@ def turntable(cameras: Sequence[Camera], num_frames: int, up: ArrayLike | None =
       `num_frames` cameras.
 
     Raises:
-      ValueError: if there are no cameras or frames, or the cameras do not look at one subject.
+      ValueError: if there are no cameras or frames, the cameras do not look at one subject, or `up` has another length.
     """
     check_int("num_frames", num_frames, 1)
     cameras = without_outlying(checked_cameras(cameras))
@@ -52,6 +52,8 @@ def turntable(cameras: Sequence[Camera], num_frames: int, up: ArrayLike | None =
         raise ValueError("cameras must look at one subject to orbit, and these do not: use smooth_path")
     subject = subject_of(viewmats)
     up = Origin.of_cameras(cameras).vertical if up is None else np.asarray(up)
+    if up.shape != (3,) or not abs(np.linalg.norm(up) - 1) < MAX_SKEW:
+        raise ValueError(f"up must be 3 numbers of unit length; got {up}")
     offsets = camera_centers(viewmats) - subject
     distances = np.maximum(np.linalg.norm(offsets, axis=1), 1e-12)
     elevation = np.arcsin(np.clip(offsets @ up / distances, -1, 1)).mean()

@@ -16,10 +16,11 @@ from a2tg_jax.base.text import counted
 from a2tg_jax.data.assembly import PointCloud, assemble_scene, every_kth, rigid_viewmat, scene_name
 from a2tg_jax.data.capture_geometry import camera_centers
 from a2tg_jax.data.colmap_cameras import ColmapCamera
-from a2tg_jax.data.colmap_files import KINDS, POINT, FrameRecord, ImageRecord, RigRecord, num_images, read_file
+from a2tg_jax.data.colmap_files import KINDS, POINT, ImageRecord, num_images, read_file
 from a2tg_jax.data.image_files import inside, on_disk, warn_of_unposed
 from a2tg_jax.data.lenses import checked_lens
-from a2tg_jax.data.photo_reading import Options, Photo, read_photos
+from a2tg_jax.data.photo_reading import Photo, SceneOptions, read_photos
+from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.ply import read_ply_points
 
 SUFFIXES = (".bin", ".txt")
@@ -32,9 +33,9 @@ POINTS_PLY = "points3D.ply"
 """Points of models without COLMAP's points3D, as depth networks write them."""
 LARGEST_MISFIT = 0.02
 """Largest distance between the places of a camera in two reconstructions, in units of the cameras' extent."""
-SAME_PLACE = 1e-3
-"""Largest distance between the cameras of a panorama, in units of the distance between neighbouring frames. A
-refined rig differs from one place by about that much."""
+SAME_PLACE = 1e-4
+"""Largest distance between the cameras of a panorama, in units of the median distance of all cameras from their median.
+Cameras of a refined rig differ by about a tenth of that."""
 
 
 class SparseModel(NamedTuple):
@@ -45,8 +46,6 @@ class SparseModel(NamedTuple):
     images: list[ImageRecord]
     points: np.ndarray
     """[P] `POINT`, by id."""
-    rigs: list[RigRecord]
-    frames: list[FrameRecord]
 
     @property
     def viewmats(self) -> np.ndarray:
@@ -93,11 +92,11 @@ def _model_of(path: Path) -> Path:
     return chosen
 
 
-def load_colmap(path: Path, options: Options) -> Scene:
+def load_colmap(path: Path, options: SceneOptions, shelf: Shelf) -> Scene:
     """Read a COLMAP scene: every registered image as a view, and the sparse points.
 
     The path is the scene folder, or the folder of the model itself. The folder `images` (or `images_k`) may be in it,
-    next to the model, or up to two folders above.
+    next to the model, or up to two folders above. Views that share a place, as of a panorama, count as one.
     """
     model = _model_of(path)
     contents = _read_model(model)
@@ -107,14 +106,13 @@ def load_colmap(path: Path, options: Options) -> Scene:
     lenses = {key: checked_lens(contents.cameras[key], f"{model}: camera {key}", options.lens) for key in used}
     # Folders in the scene folder itself may hold other pictures.
     warn_of_unposed(folder, [image.name for image in images], is_deep=folder != scene)
-    panoramas = _panoramas(contents)
-    photos = [
-        Photo(
-            image.name, viewmat, (folder, image.name), (scene / IMAGES, image.name), lenses[image.camera_id],
-            str(folder / image.name), panorama=panoramas.get(image.id),
-        )
-        for image, viewmat in zip(images, contents.viewmats, strict=True)
-    ]  # fmt: skip
+    viewmats = contents.viewmats
+    photos = []
+    for image, viewmat, panorama in zip(images, viewmats, _panoramas(viewmats), strict=True):
+        file = (folder, image.name)
+        below_images = (scene / IMAGES, image.name)
+        lens = lenses[image.camera_id]
+        photos.append(Photo(image.name, viewmat, file, below_images, lens, str(folder / image.name), panorama=panorama))
 
     def how_to_remove(name: str) -> str:
         file = _model_files(model)["images"]
@@ -125,7 +123,7 @@ def load_colmap(path: Path, options: Options) -> Scene:
             f"model.deregister_frame(model.find_image_with_name({name!r}).frame_id); model.write({str(model)!r})"
         )
 
-    shots = read_photos(photos, options, path, scene, how_to_remove)
+    shots = read_photos(photos, options, shelf, path, scene, how_to_remove)
     train, test = every_kth(shots, options.test_every)
     return assemble_scene(scene_name(scene), train, test, _start_cloud(model, contents), source=str(path))
 
@@ -206,24 +204,21 @@ def viewmat_of(image: ImageRecord) -> np.ndarray:
     return rigid_viewmat(viewmat, image.name)
 
 
-def _panoramas(model: SparseModel) -> dict[int, int]:
-    """Return the frame of each image whose rig looks around from one place (`SAME_PLACE`), both by their ids."""
-    frames = {image_id: frame for frame in model.frames for image_id in frame.image_ids}
-    # Images without a frame get negative numbers, which no frame has.
-    ids = [frames[image.id].id if image.id in frames else -image.id for image in model.images]
-    places = dict(zip(ids, camera_centers(model.viewmats), strict=True))
-    reach = 0.0
-    if len(places) > 1:
-        centers = np.stack(list(places.values()))
-        # The nearest of two is the centre itself.
-        reach = SAME_PLACE * float(np.median(cKDTree(centers).query(centers, k=2)[0][:, 1]))
-    around = set()
-    for rig in model.rigs:
-        offsets = [np.inf if place is None else float(np.linalg.norm(place)) for place in rig.translations]
-        # A rig of one sensor has no translations and is no panorama.
-        if offsets and np.max(offsets) <= reach:
-            around.add(rig.id)
-    return {image_id: frame.id for image_id, frame in frames.items() if frame.rig_id in around}
+def _panoramas(viewmats: np.ndarray) -> list[int | None]:
+    """Return for each view [V, 4, 4] a number of its place, if other views share it (`SAME_PLACE`), or None."""
+    if not len(viewmats):
+        return []
+    centers = camera_centers(viewmats)
+    distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
+    reach = SAME_PLACE * float(np.median(distances))
+    tree = cKDTree(centers)
+    places: dict[int, int] = {}
+    for view, center in enumerate(centers):
+        if view not in places:
+            here = tree.query_ball_point(center, reach)
+            if len(here) > 1:
+                places.update(dict.fromkeys(here, view))
+    return [places.get(view) for view in range(len(centers))]
 
 
 def _model_files(folder: Path) -> dict[str, Path]:
@@ -263,7 +258,7 @@ def _read_model(model: Path) -> SparseModel:
     points = records.get("points3D", np.empty(0, POINT))
     # Files have points in any order; by id, a model starts alike from its binary and its text files.
     points = points[np.argsort(points["id"], kind="stable")]
-    return SparseModel(cameras, images, points, records.get("rigs", []), records.get("frames", []))
+    return SparseModel(cameras, images, points)
 
 
 def _find_photos(path: Path, model: Path, images: Sequence[ImageRecord], downscale: int) -> tuple[Path, Path]:

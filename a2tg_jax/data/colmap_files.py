@@ -6,9 +6,6 @@ What is in them, with the binary format (little-endian, after a uint64 count of 
     images    id, pose from world to camera, camera, name, features: uint32, 7 float64, uint32, bytes up to a zero,
               uint64 count of (2 float64, uint64 id of the observed point)
     points3D  id, position, colour, error, track: uint64, 3 float64, 3 bytes, float64, uint64 count of 2 uint32
-    rigs      id, sensors, the first of which is the reference: uint32, uint32 count of 8 bytes; after each but the
-              first a byte, and if that is not 0, its pose from the rig (7 float64)
-    frames    id, rig, pose, data: 2 uint32, 7 float64, uint32 count of (int32 kind of sensor, uint32, uint64 image)
 
 A pose is a quaternion (w, x, y, z) and a translation. Text files have the same in words, a record a line, and images
 their features in a second line. References to records that do not exist are ignored, so that an image can be removed
@@ -31,12 +28,10 @@ from a2tg_jax.base.regular_files import open_regular
 from a2tg_jax.base.text import shortened
 from a2tg_jax.data.colmap_cameras import BY_NAME, MODELS, CameraModel, ColmapCamera
 
-KINDS = ("cameras", "images", "points3D", "rigs", "frames")
-"""Names of a model's files without suffix. A model has cameras and images, and the others if it needs them."""
+KINDS = ("cameras", "images", "points3D")
+"""Names of the files that are read, without suffix. A model has cameras and images."""
 POINT = np.dtype([("id", "<u8"), ("position", "<f8", 3), ("color", "u1", 3), ("error", "<f8")])
 LONGEST_NAME = 4096
-CAMERA_SENSOR = 0
-"""Kind of the sensors that take images."""
 LONGEST_LINE = 1 << 26
 """Longest line in bytes. The points of an image with a million features take half of that."""
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
@@ -52,22 +47,6 @@ class ImageRecord(NamedTuple):
     """Quaternion and translation from world to camera."""
     camera_id: int
     name: str
-
-
-class RigRecord(NamedTuple):
-    """Sensors that are fixed to each other."""
-
-    id: int
-    translations: list[list[float] | None]
-    """Translations from the rig to each sensor but the first; None if it is unknown."""
-
-
-class FrameRecord(NamedTuple):
-    """Images that a rig took at one time."""
-
-    id: int
-    rig_id: int
-    image_ids: list[int]
 
 
 def num_images(path: Path) -> int:
@@ -172,9 +151,6 @@ class _Bytes:
         self.skip(8 * self.whole("Q"))  # The track, which is not needed.
         return point
 
-    def is_camera(self) -> bool:
-        return self.whole("i") == CAMERA_SENSOR
-
 
 class _Words:
     """What is in a line of a text file, in order; of images also the line of features after it."""
@@ -230,9 +206,6 @@ class _Words:
             raise ValueError("the track of a point must be pairs")
         return number, position, color, error
 
-    def is_camera(self) -> bool:
-        return next(self.words) == b"CAMERA"
-
 
 Source = _Bytes | _Words
 
@@ -251,34 +224,11 @@ def _image(source: Source) -> ImageRecord:
     return image
 
 
-def _rig(source: Source) -> RigRecord:
-    number = source.whole()
-    translations: list[list[float] | None] = []
-    for index in range(source.whole()):
-        source.is_camera()
-        source.whole()
-        if index:  # The first sensor, the reference, has no pose.
-            translations.append(source.floats(7)[4:] if source.whole("B") else None)
-    return RigRecord(number, translations)
-
-
-def _frame(source: Source) -> FrameRecord:
-    number = source.whole()
-    rig = source.whole()
-    source.floats(7)
-    images = []
-    for _ in range(source.whole()):
-        is_camera = source.is_camera()
-        source.whole()
-        image = source.whole("Q")
-        if is_camera:
-            images.append(image)
-    return FrameRecord(number, rig, images)
-
-
 RECORDS: dict[str, Callable[[Source], Any]] = {
-    "cameras": _camera, "images": _image, "points3D": lambda source: source.point(), "rigs": _rig, "frames": _frame,
-}  # fmt: skip
+    "cameras": _camera,
+    "images": _image,
+    "points3D": lambda source: source.point(),
+}
 
 
 def _read_binary(path: Path, data: mmap.mmap | bytes, kind: str) -> Any:

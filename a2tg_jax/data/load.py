@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Literal
 
 from a2tg_jax import Scene
-from a2tg_jax.base.checks import check_literal
 from a2tg_jax.base.regular_files import expanded, is_regular
-from a2tg_jax.data.assembly import check_test_every, scene_name, warn_of_lenses, with_validation_views
+from a2tg_jax.data.assembly import scene_name, warn_of_lenses, with_validation_views
 from a2tg_jax.data.colmap import find_models, load_colmap
 from a2tg_jax.data.lenses import LensUse, forget_rays
 from a2tg_jax.data.phone_captures import polycam, record3d
 from a2tg_jax.data.photo_folder import capture_hint, holds_photos, is_video
-from a2tg_jax.data.photo_reading import AlphaMeaning, MaskMeaning, Options
+from a2tg_jax.data.photo_reading import AlphaMeaning, MaskMeaning, SceneOptions
 from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.photogrammetry import metashape, realityscan
 from a2tg_jax.data.synthetic import BUILT_IN
@@ -37,23 +36,9 @@ OTHER_PROGRAMS: tuple[Callable[[Path], list[Cameras]], ...] = (polycam, record3d
 
 
 @dataclasses.dataclass(frozen=True)
-class SceneSource:
+class SceneSource(SceneOptions):
     """Where a scene comes from and how it is read: the options of `a2tg train` on it, which run.toml keeps."""
 
-    path: str = ""
-    """Scene folder with photographs and cameras, or a built-in scene, "synthetic" or "cells"; not needed with --config
-    or --resume."""
-    downscale: int = 1
-    """Factor k by which images are downscaled."""
-    test_every: int = 8
-    """Hold out every k-th image for testing; 0: train on all, for the final picture."""
-    alpha: AlphaMeaning = "transparency"
-    """Meaning of the alpha channel: transparency before a background, or a mask that leaves pixels out."""
-    mask_as: MaskMeaning = "ignored"
-    """Meaning of the pixels that masks exclude: ignored, or background, empty as transparent pixels are, which cuts
-    the subject out."""
-    lens: LensUse = "undistort"
-    """Photographs of distorted cameras, such as fisheyes: undistort them to pinholes, or keep them as they are."""
     validation: bool = False
     """Hold out every eighth training image instead of the test images, to choose options without using these."""
 
@@ -78,7 +63,12 @@ class SceneSource:
 
     def load(self, room: int | None = None) -> Scene:
         """Return the scene, which may be a built-in one. Same arguments and errors as `load_scene`."""
-        return _load(self, None if self.is_built_in else expanded(self.path), room)
+        self.check_options()
+        if self.is_built_in:
+            scene = BUILT_IN[self.path](downscale=self.downscale, test_every=self.test_every)
+        else:
+            scene = _read(expanded(self.path), self, room)
+        return with_validation_views(scene) if self.validation else scene
 
 
 def load_scene(
@@ -127,60 +117,56 @@ def load_scene(
       >>> len(scene.train), len(scene.test)
       (7, 1)
     """
-    source = SceneSource("", downscale, test_every, alpha, mask_as, lens)
-    return _load(source, expanded(path), room)
+    options = SceneOptions("", downscale, test_every, alpha, mask_as, lens)
+    options.check_options()
+    return _read(expanded(path), options, room)
 
 
 def is_scene(folder: Path) -> bool:
     """Return whether a folder holds a scene in a known format."""
-    return _loader(folder) is not None or bool(_cameras_of_other_programs(folder))
+    return _loader(folder) is not None
 
 
-def _load(source: SceneSource, path: Path | None, room: int | None) -> Scene:
-    """Return the scene at a path, which may have the name of a built-in one; None: the built-in scene of the source."""
-    check_literal("alpha", source.alpha, AlphaMeaning)
-    check_literal("mask_as", source.mask_as, MaskMeaning)
-    check_literal("lens", source.lens, LensUse)
-    if source.alpha == "mask" and source.mask_as == "background":
-        raise ValueError(
-            "`alpha` must be transparency where `mask_as` is background, which makes pixels transparent; got mask"
-        )
-    downscale = source.downscale
-    if downscale < 1 or downscale != int(downscale):
-        raise ValueError(f"downscale must be a whole number of at least 1; got {downscale}")
-    check_test_every(source.test_every)
+def _read(path: Path, options: SceneOptions, room: int | None) -> Scene:
+    """Read the scene at a path, or raise FileNotFoundError that says what is there instead."""
     if room is not None and room < 0:
         raise ValueError(f"room must be at least 0 bytes; got {room}")
-    if path is None:
-        scene = BUILT_IN[source.path](downscale=downscale, test_every=source.test_every)
-    else:
-        options = Options(int(downscale), source.test_every, source.alpha, source.mask_as, source.lens, Shelf(room))
-        try:
-            scene = _read(path, options)
-        finally:
-            forget_rays()
-        warn_of_lenses(scene)
-    return with_validation_views(scene) if source.validation else scene
-
-
-def _read(path: Path, options: Options) -> Scene:
-    """Read the scene at a path, or raise FileNotFoundError that says what is there instead."""
     if not path.exists():
         built_in = f"; the built-in scene is {path}_scene()" if str(path) in BUILT_IN else ""
         raise FileNotFoundError(f"{path}: no such scene folder{built_in}")
     if is_video(path):
         command = f"`a2tg sfm {as_argument(path)} SCENE`"
         raise ValueError(f"{path}: is a video; to make a scene of it, run {command} first")
-    # OpenSfM's reconstruction.json is JSON as well, but no transforms file.
-    if path.suffix.lower() == ".json" and is_regular(path) and capture_hint(path) is None:
-        return load_transforms(path, options)
     load = _loader(path)
-    if load is not None:
-        return load(options)
-    cameras = _cameras_of_other_programs(path)
-    if cameras:
-        return load_frames(cameras, options)
-    raise FileNotFoundError(f"{path}: {_what_to_give_instead(path)}")
+    if load is None:
+        raise FileNotFoundError(f"{path}: {_what_to_give_instead(path)}")
+    try:
+        scene = load(dataclasses.replace(options, downscale=int(options.downscale)), Shelf(room))
+    finally:
+        forget_rays()
+    warn_of_lenses(scene)
+    return scene
+
+
+def _loader(path: Path) -> Callable[[SceneOptions, Shelf], Scene] | None:
+    """Return the function that loads what is at a path, or None."""
+    if is_regular(path):
+        # OpenSfM's reconstruction.json is JSON as well, but no transforms file.
+        if path.suffix.lower() == ".json" and capture_hint(path) is None:
+            return functools.partial(load_transforms, path)
+    elif find_models(path):
+        return functools.partial(load_colmap, path)
+    elif is_regular(path / NERFSTUDIO_FILE):
+        return functools.partial(load_folder, path)
+    elif is_regular(path / BLENDER_FILES[0]):
+        return functools.partial(load_blender, path)
+    elif find_models(path / "colmap"):  # nerfstudio's, whose transforms.json is preferred
+        return functools.partial(load_colmap, path / "colmap")
+    for find in OTHER_PROGRAMS:
+        cameras = find(path)
+        if cameras:
+            return functools.partial(load_frames, cameras)
+    return None
 
 
 def _what_to_give_instead(path: Path) -> str:
@@ -204,24 +190,3 @@ def _what_to_give_instead(path: Path) -> str:
         "has no sparse model (sparse/0) and no transforms.json or transforms_train.json; "
         f"for plain photographs, run `{command}` first"
     )
-
-
-def _loader(path: Path) -> Callable[[Options], Scene] | None:
-    """Return the function that loads a folder with a COLMAP model or a transforms file, or None."""
-    if find_models(path):
-        return functools.partial(load_colmap, path)
-    if is_regular(path / NERFSTUDIO_FILE):
-        return functools.partial(load_folder, path)
-    if is_regular(path / BLENDER_FILES[0]):
-        return functools.partial(load_blender, path)
-    below = path / "colmap"  # nerfstudio's, whose transforms.json is preferred
-    return functools.partial(load_colmap, below) if find_models(below) else None
-
-
-def _cameras_of_other_programs(path: Path) -> list[Cameras]:
-    """Return the cameras of the first program that has some in a folder or a file, the preferred ones first."""
-    for find in OTHER_PROGRAMS:
-        cameras = find(path)
-        if cameras:
-            return cameras
-    return []

@@ -10,7 +10,7 @@ import math
 import re
 import warnings
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
 
@@ -41,6 +41,7 @@ CAMERA_PICTURE = "cameras.png"
 """Picture of the cameras that `a2tg sfm` puts next to `sparse`."""
 OWN_SUFFIXES = (".png", ".webp")
 """Suffixes of the pictures that this program writes."""
+OWN = "written by a2tg"
 LISTS = (".a2tg-run", ".a2tg-frames")
 """Lists of what runs and renders wrote into a folder, a name a line, after its checksum if it has one."""
 MOST_LIST_BYTES = 1 << 26
@@ -113,47 +114,54 @@ def find_photos(folder: Path, least: int = LEAST_PHOTOS, chosen: Sequence[Path] 
         hint = capture_hint(file)
         if hint is not None:
             raise ValueError(f"{file}: {hint}")
-    below = _files_below(folder) if chosen is None else set(chosen)
-    files = sorted(file.relative_to(folder) for file in below)
-    names = [file.as_posix() for file in files if file.suffix.lower() in PHOTO_SUFFIXES]
+    found = _files_below(folder) if chosen is None else set(chosen)
+    files = sorted(file.relative_to(folder) for file in found)
+    pictures = [file.as_posix() for file in files if file.suffix.lower() in PHOTO_SUFFIXES]
     unread = [file for file in files if file.suffix.lower() not in PHOTO_SUFFIXES]
-    left_out = {
-        "written by a2tg": _written(folder, names),
-        # Such as @eaDir, Synology's folder of thumbnails.
-        "in hidden folders": {name for name in names if any(part[0] in ".@" for part in name.split("/")[:-1])},
-        "masks or depth maps": _masks(names),
-    }
+    left_out = _left_out(folder, pictures)
     others = set().union(*left_out.values())
-    copies = _copies(folder, [name for name in names if name not in others])
-    left_out["copies of others"] = copies
-    others |= copies
-    counts = [f"{kind}: {len(each)} ({first_names(_patterns(each))})" for kind, each in left_out.items() if each]
-    about_others = f"Not taken for photographs: {'; '.join(counts)}"
-    if others != left_out["written by a2tg"]:
-        about_others += ". To use some, give a folder of these only"
-    photos = [name for name in names if name not in others]
+    photos = [name for name in pictures if name not in others]
     if len(photos) < least:
         held = counted(len(photos), "photograph")
         if chosen is not None:
-            sentences = [f"{held} of {folder} given"]
+            outcome = f"{held} of {folder} given"
         elif files:
-            sentences = [f"{folder}: holds {held if photos else 'no photographs'}"]
+            outcome = f"{folder}: holds {held if photos else 'no photographs'}"
         else:
-            sentences = [f"{folder}: is empty"]
-        sentences[0] += f"; at least {counted(least, 'photograph')} {'is' if least == 1 else 'are'} needed"
-        if others:
-            sentences.append(about_others)
+            outcome = f"{folder}: is empty"
+        sentences = [f"{outcome}; at least {counted(least, 'photograph')} {'is' if least == 1 else 'are'} needed"]
+        if left_out:
+            sentences.append(_about_left_out(left_out))
         if chosen is None and other_run(folder) is not None:
             sentences.append(f"{folder} {capture_hint(folder)}")
         elif unread:
             sentences.append(_skipped(folder, unread))
         raise ValueError(". ".join(sentences))
-    if others:
-        warnings.warn(f"{folder}: {about_others}", stacklevel=3)
+    if left_out:
+        warnings.warn(f"{folder}: {_about_left_out(left_out)}", stacklevel=3)
     foreign = [file for file in unread if file.suffix.lower() in FOREIGN_SUFFIXES + VIDEO_SUFFIXES + SPHERICAL_SUFFIXES]
     if foreign:
         warnings.warn(f"{folder}: {_skipped(folder, foreign)}", stacklevel=3)
     return photos
+
+
+def _left_out(folder: Path, pictures: Sequence[str]) -> dict[str, set[str]]:
+    """Return the pictures that are no photographs by what they are, without kinds of which there are none."""
+    left_out = {
+        OWN: _written(folder, pictures),
+        # Such as @eaDir, Synology's folder of thumbnails.
+        "in hidden folders": {name for name in pictures if any(part[0] in ".@" for part in name.split("/")[:-1])},
+        "masks or depth maps": _masks(pictures),
+    }
+    others = set().union(*left_out.values())
+    left_out["copies of others"] = _copies(folder, [name for name in pictures if name not in others])
+    return {kind: names for kind, names in left_out.items() if names}
+
+
+def _about_left_out(left_out: Mapping[str, set[str]]) -> str:
+    counts = [f"{kind}: {len(names)} ({first_names(_patterns(names))})" for kind, names in left_out.items()]
+    advice = "" if left_out.keys() == {OWN} else ". To use some, give a folder of these only"
+    return f"Not taken for photographs: {'; '.join(counts)}{advice}"
 
 
 def _files_below(folder: Path) -> Iterator[Path]:

@@ -11,6 +11,7 @@ Next to the folder `images` may be
 """
 
 import contextlib
+import dataclasses
 import functools
 import os
 import warnings
@@ -24,9 +25,10 @@ from PIL import Image
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from a2tg_jax import DepthMap, Mask
+from a2tg_jax.base.checks import check_literal
 from a2tg_jax.base.npz import read_npy
 from a2tg_jax.base.text import shortened
-from a2tg_jax.data.assembly import Shot
+from a2tg_jax.data.assembly import Shot, check_test_every
 from a2tg_jax.data.decoding import MAX_PIXELS, picture_size, read_grey, read_pixels
 from a2tg_jax.data.image_files import find_image, map_in_threads, on_disk
 from a2tg_jax.data.lenses import Lens, LensUse, resize_pixels
@@ -57,16 +59,37 @@ ROUNDING = 1.0
 """Largest difference in pixels between a side of a smaller copy and the photograph's side divided by the downscale."""
 
 
-class Options(NamedTuple):
-    """Options of `load_scene` for the readers of all formats."""
+@dataclasses.dataclass(frozen=True)
+class SceneOptions:
+    """Where a scene is and how its photographs are read."""
 
-    downscale: int
-    test_every: int
-    alpha: AlphaMeaning
-    mask_as: MaskMeaning
-    lens: LensUse
-    shelf: Shelf
-    """Store of the pixels."""
+    path: str = ""
+    """Scene folder with photographs and cameras, or a built-in scene, "synthetic" or "cells"; not needed with --config
+    or --resume."""
+    downscale: int = 1
+    """Factor k by which images are downscaled."""
+    test_every: int = 8
+    """Hold out every k-th image for testing; 0: train on all, for the final picture."""
+    alpha: AlphaMeaning = "transparency"
+    """Meaning of the alpha channel: transparency before a background, or a mask that leaves pixels out."""
+    mask_as: MaskMeaning = "ignored"
+    """Meaning of the pixels that masks exclude: ignored, or background, empty as transparent pixels are, which cuts
+    the subject out."""
+    lens: LensUse = "undistort"
+    """Photographs of distorted cameras, such as fisheyes: undistort them to pinholes, or keep them as they are."""
+
+    def check_options(self) -> None:
+        """Raise ValueError, naming the option, if one is invalid."""
+        check_literal("alpha", self.alpha, AlphaMeaning)
+        check_literal("mask_as", self.mask_as, MaskMeaning)
+        check_literal("lens", self.lens, LensUse)
+        if self.alpha == "mask" and self.mask_as == "background":
+            raise ValueError(
+                "`alpha` must be transparency where `mask_as` is background, which makes pixels transparent; got mask"
+            )
+        if self.downscale < 1 or self.downscale != int(self.downscale):
+            raise ValueError(f"downscale must be a whole number of at least 1; got {self.downscale}")
+        check_test_every(self.test_every)
 
 
 class Photo(NamedTuple):
@@ -105,13 +128,19 @@ class _Files(NamedTuple):
 
 
 def read_photos(
-    photos: Sequence[Photo], options: Options, place: Path, root: Path, how_to_remove: Callable[[str], str]
+    photos: Sequence[Photo],
+    options: SceneOptions,
+    shelf: Shelf,
+    place: Path,
+    root: Path,
+    how_to_remove: Callable[[str], str],
 ) -> list[Shot]:
     """Read the photographs of a scene.
 
     Args:
       photos: the photographs.
-      options: of `load_scene`.
+      options: how they are read.
+      shelf: store of the pixels.
       place: path of the scene in messages.
       root: the scene's folder, which has no smaller copies: its siblings are other scenes.
       how_to_remove: function from an image name to advice on removing it from the scene.
@@ -125,7 +154,7 @@ def read_photos(
                 f"{each.image}: is the only file for {name} and {each.photo.name}; put both there, or remove one from "
                 "the scene"
             )
-    read = map_in_threads(lambda each: _read(each, options), files)
+    read = map_in_threads(lambda each: _read(each, options, shelf), files)
     masks = [each.mask for each in files if each.mask is not None]
     lacking = [each.photo.name for each in files if each.mask is None]
     if not masks:
@@ -166,7 +195,7 @@ def warn_of_grey(grey: Sequence[Path], masks: Sequence[Path]) -> None:
         )
 
 
-def _read(files: _Files, options: Options) -> tuple[Shot, Path | None]:
+def _read(files: _Files, options: SceneOptions, shelf: Shelf) -> tuple[Shot, Path | None]:
     """Read a photograph, and undistort and downscale it. Also return its mask file if that has areas that are neither
     black nor white."""
     photo = files.photo
@@ -174,31 +203,30 @@ def _read(files: _Files, options: Options) -> tuple[Shot, Path | None]:
     height, width = photograph.shape[:2]
     stored = (width, height)
     lens = _lens_of(files, stored, options.downscale)
-    mask = None if files.mask is None else read_mask(files.mask, stored, lens.size)
     try:
         size, K = lens.view_of(stored, files.downscale)
         rays = lens.rays(*size)
     except ValueError as error:
         raise ValueError(f"{photo.what}: its camera model {error}") from None
+    mask = None if files.mask is None else read_mask(files.mask, stored, lens.size)
     pixels = photograph
-    counts = None
     if mask is not None and options.mask_as == "background":
-        pixels = _cut_out(pixels, mask.counts)
-    elif mask is not None:
-        counts = _view_mask(mask.counts, files.mask_downscale, lens, size)
+        pixels = _cut_out(photograph, mask.counts)
     pixels = lens.view_pixels(pixels, files.downscale)
+    counted = []
+    if mask is not None and options.mask_as == "ignored":
+        counted.append(_view_mask(mask.counts, files.mask_downscale, lens, size))
     if mask is None and photo.counted is not None:
-        counts = photo.counted(pixels)
+        counted.append(photo.counted(pixels))
     if options.alpha == "mask" and pixels.shape[2] == 4:
-        is_opaque = pixels[..., 3] == 255
-        counts = is_opaque if counts is None else is_opaque & counts
+        counted.append(pixels[..., 3] == 255)
         pixels = np.ascontiguousarray(pixels[..., :3])  # A view would keep the alpha channel in memory.
     shot = Shot(
         photo.name,
         photo.viewmat,
         K,
-        options.shelf.keep(pixels, files.image if pixels is photograph else None),
-        None if counts is None else Mask.of(counts),
+        shelf.keep(pixels, files.image if pixels is photograph else None),
+        Mask.of(np.logical_and.reduce(counted)) if counted else None,
         rays,
         None if files.depths is None else _depth_map(files.depths, lens, stored, size),
         photo.panorama,

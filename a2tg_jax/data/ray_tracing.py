@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.ndimage import zoom
 
-from a2tg_jax.core.geometry import fibonacci
+from a2tg_jax.base.even_spacing import fibonacci
 
 NEAR = 1e-3
 """Smallest t of a hit; nearer ones are the point itself."""

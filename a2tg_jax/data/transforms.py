@@ -28,7 +28,8 @@ from a2tg_jax.data.colmap import points_in_world_of
 from a2tg_jax.data.colmap_cameras import ColmapCamera
 from a2tg_jax.data.image_files import inside
 from a2tg_jax.data.lenses import Lens, LensUse, checked_lens
-from a2tg_jax.data.photo_reading import Counted, Options, Photo, read_photos
+from a2tg_jax.data.photo_reading import Counted, Photo, SceneOptions, read_photos
+from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.ply import read_ply_points
 
 NERFSTUDIO_FILE = "transforms.json"
@@ -62,14 +63,14 @@ class Cameras(NamedTuple):
     """Function that reads them."""
 
 
-def load_transforms(file: Path, options: Options) -> Scene:
+def load_transforms(file: Path, options: SceneOptions, shelf: Shelf) -> Scene:
     """Read a nerfstudio or instant-ngp scene.
 
     The lists train_filenames, test_filenames and val_filenames decide the split if the file has them (val is the test
     split without a test list); otherwise test_every does. A warning counts frames that the lists leave out.
     """
     meta = _read_meta(file)
-    (shots,) = _read_shots({file: meta}, options)
+    (shots,) = _read_shots({file: meta}, options, shelf)
     lists = {key: set(meta[key]) for key in SPLIT_KEYS if key in meta}
     if lists:
         train, test = _split_by_lists(file, shots, lists)
@@ -101,7 +102,7 @@ def _split_by_lists(file: Path, shots: Sequence[Shot], lists: dict[str, set[str]
     return train, [shot for shot in shots if shot.name in test_names]
 
 
-def load_blender(folder: Path, options: Options) -> Scene:
+def load_blender(folder: Path, options: SceneOptions, shelf: Shelf) -> Scene:
     """Read a Blender scene in the format of NeRF: transforms_train.json, transforms_test.json, images with alpha.
 
     Most such scenes have no points, and start where their photographs agree. Without a test file, every test_every-th
@@ -111,7 +112,7 @@ def load_blender(folder: Path, options: Options) -> Scene:
     warn_of_others(train_file, transforms_in(folder))
     files = [train_file, test_file] if is_regular(test_file) else [train_file]
     metas = {file: _read_meta(file) for file in files}
-    train, *test_files = _read_shots(metas, options)
+    train, *test_files = _read_shots(metas, options, shelf)
     cloud = _points_beside(train_file, list(metas.values()), train)
     if test_files:
         test = test_files[0]
@@ -120,12 +121,12 @@ def load_blender(folder: Path, options: Options) -> Scene:
     return assemble_scene(scene_name(folder), train, test, cloud, source=str(folder), is_object=True)
 
 
-def load_frames(cameras: Sequence[Cameras], options: Options) -> Scene:
+def load_frames(cameras: Sequence[Cameras], options: SceneOptions, shelf: Shelf) -> Scene:
     """Make a scene of the first of some cameras of another program, with a warning that names the others."""
     chosen = cameras[0]
     warn_of_others(chosen.file, [each.file for each in cameras])
     frames = chosen.read()
-    (shots,) = _read_shots({frames.file: {"frames": frames.frames}}, options, frames.counted)
+    (shots,) = _read_shots({frames.file: {"frames": frames.frames}}, options, shelf, frames.counted)
     name = scene_name(frames.file.resolve().parent)
     train, test = every_kth(shots, options.test_every)
     return assemble_scene(name, train, test, frames.cloud, source=str(frames.file))
@@ -142,10 +143,10 @@ def warn_of_others(chosen: Path, files: Sequence[Path]) -> None:
         )
 
 
-def load_folder(folder: Path, options: Options) -> Scene:
+def load_folder(folder: Path, options: SceneOptions, shelf: Shelf) -> Scene:
     """Read the transforms.json of a folder, with a warning if others are next to it."""
     warn_of_others(folder / NERFSTUDIO_FILE, transforms_in(folder))
-    return load_transforms(folder / NERFSTUDIO_FILE, options)
+    return load_transforms(folder / NERFSTUDIO_FILE, options, shelf)
 
 
 def transforms_in(folder: Path) -> list[Path]:
@@ -202,7 +203,7 @@ def _read_meta(file: Path) -> dict[str, Any]:
 
 
 def _read_shots(
-    metas: Mapping[Path, dict[str, Any]], options: Options, counted: Counted | None = None
+    metas: Mapping[Path, dict[str, Any]], options: SceneOptions, shelf: Shelf, counted: Counted | None = None
 ) -> list[list[Shot]]:
     """Return the frames of each transforms file of a scene, downscaled, in the file's order.
 
@@ -212,7 +213,8 @@ def _read_shots(
     for file, meta in metas.items():
         photos += [_photo(file, {**meta, **frame}, options.lens, counted) for frame in meta["frames"]]
     place = next(iter(metas))
-    shots = iter(read_photos(photos, options, place, place.parent, lambda name: f"remove its frame from {place}"))
+    read = read_photos(photos, options, shelf, place, place.parent, lambda name: f"remove its frame from {place}")
+    shots = iter(read)
     return [list(itertools.islice(shots, len(meta["frames"]))) for meta in metas.values()]
 
 

@@ -104,7 +104,7 @@ class CloneSplitPrune(StepEvent):
         is_kept = _is_live(model) & ~self._is_pruned(now, model)
         # Copies of pruned rows would be pruned as well.
         is_wanted = is_kept & (gradients >= self.threshold)
-        room = min(model.gaussians.num, self.cap) - jnp.sum(is_kept, dtype=jnp.int32)
+        room = min(model.num_rows, self.cap) - jnp.sum(is_kept, dtype=jnp.int32)
         plan = self._planned(now, model, is_kept, is_wanted & (_ranks(gradients, is_wanted) < room))
         return plan, jnp.sum(is_wanted & ~(plan.is_cloned | plan.is_split), dtype=jnp.int32)
 
@@ -156,7 +156,7 @@ class FillingDensity(CloneSplitPrune):
 
 
 def _is_live(model: Model) -> Array:
-    return jnp.arange(model.gaussians.num, dtype=jnp.int32) < model.live_count
+    return jnp.arange(model.num_rows, dtype=jnp.int32) < model.live_count
 
 
 def _ranks(values: Array, is_ranked: Array) -> Array:
@@ -172,7 +172,7 @@ def apply_plan(key: Array, plan: CloneSplitPlan, model: Model, moments: AdamStat
     Both halves of a split Gaussian are drawn from it, each a Gaussian 1.6 times smaller. A clone has the place of its
     original, which keeps its moments.
     """
-    num = model.gaussians.num
+    num = model.num_rows
     index = jnp.arange(num, dtype=jnp.int32)
     is_doubled = plan.is_cloned | plan.is_split
     num_kept = jnp.sum(plan.is_kept, dtype=jnp.int32)

@@ -7,7 +7,6 @@ from another model.
 """
 
 import dataclasses
-from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -18,9 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from a2tg_jax.appearance import allocate_appearance
 from a2tg_jax.base.checks import check_number
+from a2tg_jax.base.even_spacing import evenly_chosen
 from a2tg_jax.core.cameras import back_project
 from a2tg_jax.core.gaussians import Gaussians, no_rows, sh_of_colors
-from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.origin import Color
 from a2tg_jax.core.pytree import pytree, static
@@ -29,7 +28,6 @@ from a2tg_jax.events import Change, Due, HostEvent, Times, clear_moments, times_
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderOutput
 from a2tg_jax.render import jitted_render
-from a2tg_jax.renderer import plan_render
 from a2tg_jax.scene import View, counted_pixels, view_image
 
 # Chosen in experiments/NOTEBOOK.md, "New Gaussians where pictures are wrong".
@@ -76,14 +74,13 @@ class PlaceByError(HostEvent):
             raise ValueError("share must be 0 in a stage whose Gaussians have textures or differ in degree")
         num = model.num
         num_added = round(num * float(self.share))
-        room = min(self.cap, model.gaussians.num) - num
+        room = min(self.cap, model.num_rows) - num
         if not num_added:
             return Change(model, moments, state, unused=f"share of {num:,} Gaussians is less than one: raise it")
         if room <= 0:
             reason = "share adds no Gaussian, because there are as many as the cap allows; prune some before"
             return Change(model, moments, state, unused=reason)
-        rng = np.random.default_rng((due.seed, due.index))
-        added = gaussians_at_errors(model, due.views, due.background, min(num_added, room), rng)
+        added = gaussians_at_errors(model, due, min(num_added, room))
         if not added.num:
             reason = "share adds no Gaussian, because views are right wherever a surface is drawn and masks count"
             return Change(model, moments, state, unused=reason)
@@ -98,28 +95,25 @@ class PlaceByError(HostEvent):
 
         present = model.gaussians, model.appearance
         gaussians, appearance = map_rows(replaced, replaced, present, (added, appearance))
-        is_new = np.isin(np.arange(model.gaussians.num), rows)
+        is_new = np.isin(np.arange(model.num_rows), rows)
         moments = jax.jit(clear_moments)(model, moments, is_new)
         num_live = jax.device_put(np.asarray(num + added.num, np.int32))
         model = dataclasses.replace(model, gaussians=gaussians, appearance=appearance, num_live=num_live)
         return Change(model, moments, state)
 
 
-def gaussians_at_errors(
-    model: Model, views: Sequence[View], background: Color, num: int, rng: np.random.Generator
-) -> Gaussians:
+def gaussians_at_errors(model: Model, due: Due, num: int) -> Gaussians:
     """Return `num` Gaussians at pixels of some views, drawn in proportion to the mean difference of their colours
     (host). Pixels that masks exclude, or that show no surface, are left out. If no pixel is wrong there are none.
 
     Raises:
       ValueError: if there are no views.
     """
-    if not views:
-        raise ValueError("views must hold at least one view; got none")
-    views = evenly_chosen(views, MOST_VIEWS)
+    views = evenly_chosen(due.views, MOST_VIEWS)
+    settings = due.render_settings(model, views)
+    rng = np.random.default_rng((due.seed, due.index))
     dtype = model.gaussians.means.dtype
-    settings = plan_render(model, [view.camera for view in views])
-    behind = jnp.asarray(background, dtype)
+    behind = jnp.asarray(due.background, dtype)
     totals = []
     drawn = []
     for view in views:
@@ -127,7 +121,7 @@ def gaussians_at_errors(
         output, _ = jitted_render()(
             model.gaussians, camera, model.appearance, behind, settings, num_live=model.num_live
         )
-        total, pixels = _drawn_pixels(view, background, jax.tree.map(np.asarray, output), num, rng)
+        total, pixels = _drawn_pixels(view, due.background, jax.tree.map(np.asarray, output), num, rng)
         totals.append(total)
         drawn.append(pixels)
     if not sum(totals):

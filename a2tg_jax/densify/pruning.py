@@ -25,7 +25,6 @@ from a2tg_jax.events import LEAST_LEFT, Change, Due, HostEvent, Times, keep_rows
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.views import render_traced
-from a2tg_jax.renderer import plan_render
 from a2tg_jax.scene import View, counted_pixels, views_by_kind
 
 
@@ -81,7 +80,7 @@ class Prune(_Pruning):
                 stacklevel=2,
             )
             left = num
-        weights = shown_in(model, due.views).weights
+        weights = shown_in(model, due).weights
         is_kept = np.zeros(num, bool)
         is_kept[np.argsort(-weights[:num], kind="stable")[:left]] = True
         return keep_rows(model, moments, state, is_kept)
@@ -102,20 +101,18 @@ class Contributions(NamedTuple):
     """[N] number of the views in which Σ α·T is large enough."""
 
 
-def shown_in(model: Model, views: Sequence[View], least: float = 1.0) -> Contributions:
+def shown_in(model: Model, due: Due, least: float = 1.0) -> Contributions:
     """Return how much each of N Gaussians contributes, and in how many views by at least `least` pixels (host).
 
     Spare rows show nothing. Of the views, at least one, only cameras and masks are used.
     """
-    if not views:
-        raise ValueError("views must hold at least one view; got none")
-    total = np.zeros(model.gaussians.num)
-    num_views = np.zeros(model.gaussians.num, np.int64)
+    total = np.zeros(model.num_rows)
+    num_views = np.zeros(model.num_rows, np.int64)
     if not len(total):
         return Contributions(total, num_views)
     dtype = model.gaussians.means.dtype
-    settings = plan_render(model, [view.camera for view in views])
-    for alike in views_by_kind(views):
+    settings = due.render_settings(model, due.views)
+    for alike in views_by_kind(due.views):
         rays = alike[0].camera.rays
         rays = None if rays is None else jnp.asarray(rays, dtype)
         cameras = [dataclasses.replace(view.camera, rays=None) for view in alike]
@@ -194,7 +191,7 @@ class PruneFloaters(_Pruning):
         num = model.num
         is_kept = np.ones(num, bool)
         if self.min_views:
-            num_views = shown_in(model, due.views, self.least).num_views[:num]
+            num_views = shown_in(model, due, self.least).num_views[:num]
             # With fewer training views than that, no Gaussian would be kept.
             is_kept = num_views >= min(self.min_views, len(due.views))
         if self.near:

@@ -51,7 +51,7 @@ class SplitByGradient(FillingMcmc):
         return "position"
 
     def init(self, model: Model) -> SplitStatistics:
-        num = model.gaussians.num
+        num = model.num_rows
         dtype = model.gaussians.means.dtype
         return SplitStatistics(GradientStatistics.init(num, dtype), jnp.zeros((num,), dtype))
 
@@ -68,7 +68,7 @@ class SplitByGradient(FillingMcmc):
         draw = functools.partial(draw_distinct_hosts, host_weights(model, state))
         moves = plan_relocation(to_move, model.appearance.opacities(model.gaussians), num_live, draw)
         model, moments, state = split_rows(to_split, moves, model, moments, state)
-        cap = min(self.cap, model.gaussians.num)
+        cap = min(self.cap, model.num_rows)
         least = self.least(now, num_live)
         # Weights again, because moved rows are smaller and share their statistic.
         draw = functools.partial(draw_distinct_hosts, host_weights(model, state))
@@ -100,7 +100,7 @@ def split_rows(
     key: Array, moves: Moves, model: Model, moments: AdamState, state: SplitStatistics
 ) -> tuple[Model, AdamState, SplitStatistics]:
     """Copy rows from their hosts. Hosts and copies are halved, lose Adam's moments and share the statistic."""
-    is_split = moves.is_reset | (moves.rows != jnp.arange(model.gaussians.num, dtype=jnp.int32))
+    is_split = moves.is_reset | (moves.rows != jnp.arange(model.num_rows, dtype=jnp.int32))
     pixels = state.pixels[moves.rows]
     total = state.gradients.total / moves.num_shares.astype(state.gradients.total.dtype)
     gradients = GradientStatistics(total[moves.rows], state.gradients.views[moves.rows])

@@ -108,7 +108,7 @@ class AdaptDegrees(HostEvent):
         return dataclasses.replace(model, appearance=model.appearance.with_coefficients(table)), moments
 
     def init(self, model: Model) -> BandStatistics:
-        return BandStatistics.init(model.gaussians.num, model.gaussians.means.dtype)
+        return BandStatistics.init(model.num_rows, model.gaussians.means.dtype)
 
     def observe(self, state: BandStatistics, model: Model, seen: Seen) -> BandStatistics:
         centers = jax.vmap(lambda camera: camera.center)(seen.cameras)

@@ -24,6 +24,7 @@ from a2tg_jax import (
     Gaussians,
     Gaussians2d,
     Model,
+    Progress,
     Renderer,
     Scene,
     Similarity,
@@ -35,9 +36,9 @@ from a2tg_jax import (
     fit_stage,
 )
 from a2tg_jax.appearance.parts import MAX_DEGREE, nearest_gaussians
+from a2tg_jax.base.even_spacing import evenly_chosen
 from a2tg_jax.core.budget import bytes_per_gaussian
 from a2tg_jax.core.gaussians import logit
-from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.origin import Color
 from a2tg_jax.core.sh import NUM_BASES, SH_C0
 from a2tg_jax.data.assembly import scene_scale
@@ -45,8 +46,6 @@ from a2tg_jax.data.capture_geometry import camera_centers, matrices_of, without_
 from a2tg_jax.finish.shrinking import fewest_texels, texel_weights
 from a2tg_jax.host.training_bar import ProgressBar
 from a2tg_jax.model import plain_gaussians
-from a2tg_jax.training.reports import Progress
-from a2tg_jax.training.stage import BACKGROUNDS, Background
 
 MOST_VIEWS = 12
 """Largest number of views, evenly chosen, for measuring where texels and spherical harmonics matter."""
@@ -239,11 +238,12 @@ def distill(
     Both are rendered over black or white, whichever is nearer to the other model's background. Each iteration renders
     one view.
     """
-    highest = model.gaussians.sh_degree
-    behind: Background = "white" if np.mean(wanted.background) > 0.5 else "black"
     # Only the second stage runs: it does not change the number of Gaussians.
-    system = Gaussians2d(stage1_iterations=1, stage2_iterations=iterations, sh_degree=highest, background=behind)
-    scene = drawn_scene(wanted, cameras, BACKGROUNDS[behind])
+    system = Gaussians2d(
+        stage1_iterations=1, stage2_iterations=iterations, sh_degree=model.gaussians.sh_degree,
+        background="white" if np.mean(wanted.background) > 0.5 else "black",
+    )  # fmt: skip
+    scene = drawn_scene(wanted, cameras, system.background_color)
     start = dataclasses.replace(model, origin=None)
     trained = fit_stage(scene, system, 1, start, progress=Progress(ProgressBar if progress else None, "bake")).model
     return dataclasses.replace(trained, origin=wanted.origin)

@@ -25,6 +25,7 @@ from a2tg_jax import (
     Gaussians,
     Model,
     Now,
+    Progress,
     Scene,
     Stage,
     StepEvent,
@@ -54,7 +55,6 @@ from a2tg_jax.host.training_bar import ProgressBar
 from a2tg_jax.io.columns import LEAST_OPACITY
 from a2tg_jax.io.compact import CompactChoices, Grids, encode_model, grids_of, half_turned
 from a2tg_jax.io.model_rows import check_encodable
-from a2tg_jax.training.reports import Progress
 
 ITERATIONS = 1000
 LAST_ROUNDED = 0.95

@@ -210,7 +210,7 @@ def log_exponents_of(shapes: np.ndarray) -> np.ndarray:
     return np.tanh(np.asarray(shapes, np.float64))
 
 
-def shapes_of(log_exponents: np.ndarray) -> np.ndarray:
+def checked_shapes(log_exponents: np.ndarray) -> np.ndarray:
     """Return the shapes of kernels of logarithms of exponents, float64. Logarithms that rounding has moved beyond ±1
     are cut to ±1; ValueError: one is NaN or farther out than rounding moves it."""
     logarithms = np.asarray(log_exponents, np.float64)

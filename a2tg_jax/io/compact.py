@@ -31,13 +31,13 @@ from a2tg_jax.io.columns import (
     ColumnReader,
     ColumnWriter,
     Precision,
+    checked_shapes,
     decode,
     ends_of,
     log_exponents_of,
     logits_of,
     morton,
     opacities_of,
-    shapes_of,
     with_w,
 )
 from a2tg_jax.io.model_rows import Rows, check_encodable, joined_rows, model_of, ordered, rows_of_model
@@ -407,5 +407,5 @@ def _rows_of(
     if appearance.exponents is not None:
         shapes = numbers("shapes", 1, num)[0]
         if isinstance(choices.shapes, int):
-            shapes = shapes_of(shapes)
+            shapes = checked_shapes(shapes)
     return Rows(means, quats, log_scales, logits, degrees, tuple(bands), sizes, texels, shapes)

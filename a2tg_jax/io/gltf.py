@@ -21,7 +21,7 @@ from a2tg_jax.base.regular_files import expanded, reading
 from a2tg_jax.base.suffixes import check_suffix
 from a2tg_jax.base.text import shortened
 from a2tg_jax.core.sh import NUM_BASES, SH_C0
-from a2tg_jax.io.columns import Ends, dequantised, ends_of, log_exponents_of, quantised, shapes_of
+from a2tg_jax.io.columns import Ends, checked_shapes, dequantised, ends_of, log_exponents_of, quantised
 from a2tg_jax.io.gltf_container import Builder, Document, mesh_nodes, scene_of_one
 from a2tg_jax.io.model_rows import Rows, check_encodable, model_of, rows_of_model
 from a2tg_jax.io.other_programs import (
@@ -269,7 +269,7 @@ def _splats(document: Document, attributes: Mapping[str, object]) -> Ellipsoids:
 
 def _shown(document: Document, described: Mapping[str, Any], splats: Ellipsoids) -> tuple[Appearance, Rows, int]:
     """Return the template, the tables and the common degree of splats, from the extension's object. ValueError: a field
-    is missing, out of range, or contradicts the"""
+    is missing, out of range, or contradicts the splats."""
     num, highest = splats.sh.shape[:2]
     base_degree = sh_degree = NUM_BASES.index(highest)
     has_textures, has_degrees, has_shapes = (name in described for name in ("sizes", "degrees", "shapes"))
@@ -303,7 +303,7 @@ def _shown(document: Document, described: Mapping[str, Any], splats: Ellipsoids)
         log_exponents = document.numbers(described["shapes"], "SCALAR", f"{EXTENSION}.shapes")[:, 0]
         if len(log_exponents) != num:
             raise ValueError(f"{EXTENSION}.shapes must be {num} numbers; got {len(log_exponents)}")
-        shapes = shapes_of(log_exponents)
+        shapes = checked_shapes(log_exponents)
     # No rows are dropped: the extension's tables are by row.
     gaussians = gaussians_of(splats, document.path, is_flat=has_textures or has_shapes, keeps_all=True)
     # `Bands` keeps tables up to the highest degree, empty ones included.

@@ -193,7 +193,7 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
     draws them. A warning names other attributes that are not read, except normals and additional colours.
     The third scale (scale_2) of a file that marks its splats as flat is dropped. Other files have ellipsoids: the
     thinnest axis of each becomes the normal and its scale is dropped, with a warning if that is more than a thousandth
-    of the
+    of the shorter other scale.
 
     Args:
       path: the file.

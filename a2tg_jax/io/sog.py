@@ -13,6 +13,7 @@ Every size, count and index is checked before it is used. `offset` and `rotation
 import io
 import json
 import math
+import warnings
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -21,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image, UnidentifiedImageError
-from scipy import sparse
+from scipy.cluster.vq import kmeans2, vq
 
 from a2tg_jax import Model
 from a2tg_jax.base.checks import check_int
@@ -421,16 +422,8 @@ def _halves(rows: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 def _clustered(rows: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return `count` centres [count, D] of rows [N, D] by k-means, and the nearest centre [N] of each row."""
-    centres = rows[np.linspace(0, len(rows) - 1, count).astype(np.int64)]
-    ones = np.ones(len(rows), np.float32)
-    for _ in range(CLUSTER_STEPS):
-        nearest = _nearest(rows, centres)
-        members = sparse.csr_array((ones, (nearest, np.arange(len(rows)))), (count, len(rows)))
-        counts = np.bincount(nearest, minlength=count)[:, None]
-        centres = np.where(counts > 0, members @ rows / np.maximum(counts, 1), centres).astype(np.float32)
-    return centres, _nearest(rows, centres)
-
-
-def _nearest(rows: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """Return the index [N] of the centre nearest to each row."""
-    return np.argmin((centres**2).sum(axis=1) - 2 * (rows @ centres.T), axis=1)
+    first = rows[np.linspace(0, len(rows) - 1, count).astype(np.int64)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Centres without rows stay where they are.
+        centres, _ = kmeans2(rows, first, CLUSTER_STEPS, minit="matrix")
+    return centres, vq(rows, centres)[0]

@@ -231,7 +231,7 @@ def _declared_axes(records: bytes) -> str:
 
 
 def _turned(gaussians: Gaussians, axes: str, wanted: str) -> Gaussians:
-    """Return Gaussians with these axes in a world with"""
+    """Return Gaussians with these axes in a world with the axes `wanted`."""
     if axes == wanted:
         return gaussians
     directions = np.array([DIRECTIONS[letter] for letter in axes], np.float64)

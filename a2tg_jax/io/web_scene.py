@@ -9,7 +9,7 @@ import dataclasses
 import numpy as np
 
 from a2tg_jax import Model
-from a2tg_jax.core.numerics import evenly_chosen
+from a2tg_jax.base.even_spacing import evenly_chosen
 from a2tg_jax.data.capture_geometry import central_camera
 from a2tg_jax.io.columns import Choice, opacities_of
 from a2tg_jax.io.compact import CompactChoices, encode_model

@@ -38,13 +38,13 @@ class TileRoom:
 
     capacities: dict[Any, int] = dataclasses.field(default_factory=dict)
 
-    def plan(self, place: object, pairs: float, head_room: float = HEAD_ROOM) -> int:
-        """Return a capacity for a number of pairs: the present one of the place if it is large enough and at most twice
-        as large as needed, or a new one."""
+    def plan(self, place: object, pairs: float, head_room: float = HEAD_ROOM, most: float = 2) -> int:
+        """Return a capacity for a number of pairs: the present one of the place if it is large enough and at most
+        `most` times as large as needed, or a new one."""
         needed = max(head_room * pairs, LEAST_CAPACITY)
         present = self.capacities.get(place, 0)
         # Lists that overflowed in an earlier training of a sweep would overflow again.
-        return present if needed <= present <= 2 * needed else self._renew(place, needed)
+        return present if needed <= present <= most * needed else self._renew(place, needed)
 
     def enlarge(self, place: object, pairs: float = 0) -> int:
         """Return a new capacity, at least twice the present one, after a list overflowed with a number of pairs."""

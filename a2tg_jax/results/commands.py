@@ -47,6 +47,11 @@ def resuming_command(run: RunFolder, devices: Devices | None = None) -> str:
     return shlex.join(words)
 
 
+def viewing_command(run: RunFolder, model: str) -> str:
+    """Return the command that shows a model of a run."""
+    return shlex.join(["a2tg", "view", str(run.path), "--model", model])
+
+
 def _devices_of_newest_checkpoint(run: RunFolder) -> Devices:
     # By time: checkpoints of several stages do not sort by name.
     checkpoints = sorted((run.path / "checkpoints").glob("*.npz"), key=os.path.getmtime)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from a2tg_jax import Model, RenderSettings, Scene, System
 from a2tg_jax.base.atomic import write_whole
+from a2tg_jax.base.even_spacing import evenly_chosen
 from a2tg_jax.base.text import budget_in_bytes, in_bytes, shortened
-from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.finish.compaction import (
     ASSUMED_PSNR,
     LADDER,

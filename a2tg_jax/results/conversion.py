@@ -9,9 +9,9 @@ from pathlib import Path
 
 from a2tg_jax import Model, load_model, save_model
 from a2tg_jax.base.archive import read_archive_header
+from a2tg_jax.base.even_spacing import evenly_chosen
 from a2tg_jax.base.regular_files import is_regular, sha256_of
 from a2tg_jax.base.text import counted, in_bytes
-from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.finish.baking import MOST_VIEWS, bake, likeness, pictures
 from a2tg_jax.io.formats import (
     file_bytes,

@@ -8,9 +8,9 @@ from pathlib import Path
 
 from a2tg_jax import Model, Scene, evaluate, load_model, save_model
 from a2tg_jax.base.atomic import replacing
+from a2tg_jax.base.even_spacing import evenly_chosen
 from a2tg_jax.base.json_text import read_json
 from a2tg_jax.base.regular_files import is_regular, sha256_of
-from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.finish.polishing import polish
 from a2tg_jax.finish.shrinking import can_shrink, shrink_textures
 from a2tg_jax.host.progress_bars import counting

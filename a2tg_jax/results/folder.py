@@ -73,6 +73,13 @@ class StageFiles:
         # Iterations have ten digits, so that names sort by number.
         return sorted((self.path / "checkpoints").glob(f"{glob.escape(name)}-{'[0-9]' * 10}.npz{ending}"))
 
+    def newest(self, name: str) -> Path | None:
+        """Return the model of a stage if it is finished, or else its newest checkpoint; None without either."""
+        if is_regular(self.model(name)):
+            return self.model(name)
+        checkpoints = self.checkpoints(name)
+        return checkpoints[-1] if checkpoints else None
+
     def drop_old_checkpoints(self, name: str) -> None:
         """Delete all checkpoints of a stage but the newest `KEPT_CHECKPOINTS`."""
         for path in self.checkpoints(name)[:-KEPT_CHECKPOINTS]:

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from a2tg_jax import Scene, View
+from a2tg_jax import RestOfRun, Scene, View
 from a2tg_jax.base.machine import default_platform
 from a2tg_jax.base.memory import allowed_memory, used_memory
 from a2tg_jax.base.text import in_bytes
@@ -18,7 +18,6 @@ from a2tg_jax.results.plan import RunPlan
 from a2tg_jax.results.record import MEMORY_OF_FILE, RunRecord
 from a2tg_jax.training.cost import STATES, StageForecast, fed_bytes, forecast_stages, held_bytes
 from a2tg_jax.training.options import SENSIBLE_GAUSSIANS
-from a2tg_jax.training.reports import RestOfRun
 
 KEPT_STATES = 3
 """Number of checkpoints on disk while a new one is written."""

@@ -14,7 +14,6 @@ from a2tg_jax.base.regular_files import is_regular, open_regular
 from a2tg_jax.base.text import shortened
 from a2tg_jax.host.optional import optional
 from a2tg_jax.results.folder import RunFolder
-from a2tg_jax.training.checkpoint import TERM
 
 NAMES = tuple(History.empty().to_dict())
 """Columns of each file; loss terms such as loss_l1 follow."""
@@ -52,7 +51,7 @@ def read_history(path: Path) -> History:
 def _read_columns(file: io.TextIOBase, names: list[str]) -> dict[str, np.ndarray]:
     """Return the columns below the first line. Raises ValueError with a reason."""
     terms = names[len(NAMES) :]
-    if tuple(names[: len(NAMES)]) != NAMES or not all(name.startswith(TERM) for name in terms):
+    if tuple(names[: len(NAMES)]) != NAMES or not all(name.startswith(History.prefix) for name in terms):
         raise ValueError(f"has the columns {shortened(', '.join(names))}; {', '.join(NAMES)} are expected")
     if len(set(terms)) < len(terms):
         raise ValueError(f"has a column twice: {shortened(', '.join(terms))}")

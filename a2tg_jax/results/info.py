@@ -1,5 +1,6 @@
 """Summary of a run folder, or of a file of splats, in a few lines of text."""
 
+import contextlib
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -7,13 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from a2tg_jax import Model, load_model
+from a2tg_jax import Model, load_checkpoint, load_model
 from a2tg_jax.base.json_text import read_json
 from a2tg_jax.base.regular_files import is_regular
 from a2tg_jax.base.text import in_bytes
 from a2tg_jax.io.formats import file_bytes, format_of, load_splats
 from a2tg_jax.results.commands import repeating_command, resuming_command
 from a2tg_jax.results.folder import RunFolder, iteration_of, old_run
+from a2tg_jax.results.model_source import chosen_stage
+from a2tg_jax.results.plan import PlannedStage, RunPlan
 from a2tg_jax.results.record import is_finished, read_record
 
 SPLITS = ("test", "validation", "train")
@@ -39,6 +42,8 @@ def describe_run(run: RunFolder) -> str:
     if facts["damage"]:
         lines.append(f"damaged  {facts['damage']}: {shlex.join(['a2tg', 'eval', str(run.path)])} rewrites it")
     if not facts["is_finished"]:
+        if facts["shown"]:
+            lines.append(f"shown    {facts['shown']}, unless --model is given")
         lines.append(f"training is not finished; continue with: {resuming_command(run)}")
     if is_regular(run.finish):
         lines.append(f"finished {run.finish} has its source and options")
@@ -99,7 +104,8 @@ def run_facts(run: RunFolder) -> dict[str, Any]:
             psnrs = read_psnrs(run.metrics)
     except ValueError as error:
         damage = str(error)
-    stages = [{"name": name, **_stage_facts(run, name), "psnr": psnrs.get(name)} for name in record.plan.names]
+    plan = record.plan
+    stages = [{"name": name, **_stage_facts(run, plan[name]), "psnr": psnrs.get(name)} for name in plan.names]
     return {
         "path": str(run.path),
         "scene": record.scene.path,
@@ -107,12 +113,21 @@ def run_facts(run: RunFolder) -> dict[str, Any]:
         "system": record.system,
         "compare": list(record.compare),
         "is_finished": is_finished(run, record),
+        "shown": _shown(run, plan),
         "stages": stages,
         "report": str(run.report) if run.report.is_file() else None,
         "page": str(run.viewer) if run.viewer.is_file() else None,
         "disk_bytes": sum(map(_size_of, run.path.rglob("*"))),
         "damage": damage,
     }
+
+
+def _shown(run: RunFolder, plan: RunPlan) -> str | None:
+    """Return the name of the stage whose model other commands take; None if nothing was kept yet."""
+    try:
+        return chosen_stage(run, plan)[0].name
+    except FileNotFoundError:
+        return None
 
 
 def facts_or_damage(run: RunFolder) -> dict[str, Any]:
@@ -145,15 +160,17 @@ def read_psnrs(path: Path) -> dict[str, dict[str, float]]:
     return psnrs
 
 
-def _stage_facts(run: RunFolder, name: str) -> dict[str, Any]:
-    """Return facts of a stage's model, or the progress of its training."""
-    path = run.model(name)
-    if not is_regular(path):
-        checkpoints = run.checkpoints(name)
-        if not checkpoints:
-            return {"state": "not begun"}
-        newest = checkpoints[-1]
-        return {"state": "in training", "iteration": iteration_of(newest), "checkpoint": str(newest)}
+def _stage_facts(run: RunFolder, planned: PlannedStage) -> dict[str, Any]:
+    """Return facts of a stage's model, or of its newest checkpoint."""
+    path = run.newest(planned.name)
+    if path is None:
+        return {"state": "not begun"}
+    if path != run.model(planned.name):
+        facts: dict[str, Any] = {"state": "in training", "iteration": iteration_of(path)}
+        facts |= {"iterations": planned.stage.iterations, "checkpoint": str(path)}
+        with contextlib.suppress(ValueError):  # Training continues from the one before a damaged checkpoint.
+            facts |= model_facts(load_checkpoint(path, system=type(planned.system)).model)
+        return facts
     try:
         model = load_model(path)
     # A damaged file must not hide the other stages.
@@ -178,7 +195,8 @@ def model_facts(model: Model) -> dict[str, Any]:
 def _stage_text(stage: Mapping[str, Any]) -> str:
     match stage["state"]:
         case "in training":
-            return f"at iteration {stage['iteration']} ({stage['checkpoint']})"
+            counts = f"; {_counts_text(stage)}" if "num_gaussians" in stage else "; its checkpoint is damaged"
+            return f"after iteration {stage['iteration']:,} of {stage['iterations']:,}{counts}"
         case "damaged":
             return f"damaged: {stage['damage']}; delete it, and a2tg train --resume trains the stage again"
         case "finished":

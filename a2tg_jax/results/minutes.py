@@ -78,12 +78,12 @@ class TimedTraining:
         minutes = counted(max(1, round(self.seconds / 60)), "minute")
         return (
             f"photographs of {self.width}×{self.height} pixels, {size}, {self.iterations:,} iterations: about "
-            f"{minutes}, if this machine stays as busy as it is now"
+            f"{minutes}, if this machine stays as busy as now"
         )
 
 
 def choose_training(path: Path, seconds: float) -> TimedTraining:
-    """Return the training of a scene that takes about so many seconds on this machine (host; measures its speed).
+    """Return the training of a scene that takes about this many seconds on this machine (host; measures its speed).
 
     Photographs and iterations grow together: four times the pixels get twice the iterations.
 
@@ -99,7 +99,7 @@ def choose_training(path: Path, seconds: float) -> TimedTraining:
 
 
 def training_within(seconds: float, speed: Speed, size: tuple[int, int], downscale: int) -> TimedTraining:
-    """Return the training that takes about so many seconds.
+    """Return the training that takes about this many seconds.
 
     Args:
       seconds: time of the training and of what follows.
@@ -124,7 +124,7 @@ def training_within(seconds: float, speed: Speed, size: tuple[int, int], downsca
         least = (LEAST_ITERATIONS * step + speed.compile_seconds) / (1 - OTHER_SHARE)
         raise ValueError(
             f"minutes are too few: {max(seconds, 0) / 60:.1f} are left to train, and this machine needs "
-            f"{math.ceil(least / 6) / 10} at least, as busy as it is now"
+            f"{math.ceil(least / 6) / 10} at least, as busy as now"
         )
     expected = iterations * step + speed.compile_seconds + OTHER_SHARE * seconds
     budget = round(BYTES_PER_PIXEL * width * height / 1e6, 2)

@@ -10,7 +10,17 @@ from pathlib import Path
 
 import numpy as np
 
-from a2tg_jax import History, Model, RenderSettings, Scene, System, load_model, save_model, transform_gaussians
+from a2tg_jax import (
+    History,
+    Model,
+    RenderSettings,
+    Scene,
+    System,
+    load_checkpoint,
+    load_model,
+    save_model,
+    transform_gaussians,
+)
 from a2tg_jax.base.regular_files import is_regular
 from a2tg_jax.base.text import first_names
 from a2tg_jax.data.load import is_scene
@@ -20,11 +30,10 @@ from a2tg_jax.io.formats import FORMATS, format_of, load_splats, splats_at
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.model import plain_gaussians
 from a2tg_jax.results.commands import first_training_command, resuming_command
-from a2tg_jax.results.folder import RunFolder, open_run, runs_in
+from a2tg_jax.results.folder import RunFolder, iteration_of, open_run, runs_in
 from a2tg_jax.results.history import write_history
-from a2tg_jax.results.plan import PlannedStage
+from a2tg_jax.results.plan import PlannedStage, RunPlan
 from a2tg_jax.results.record import RunRecord, read_record
-from a2tg_jax.training.stage import BACKGROUNDS
 from a2tg_jax.training.start import left_out, new_appearance, with_degree
 
 READABLE = [suffix for suffix, format in FORMATS.items() if format.load is not None]
@@ -72,22 +81,64 @@ class Source:
             return None
 
 
-def finished_stage(run: RunFolder, name: str | None = None) -> tuple[RunRecord, PlannedStage]:
-    """Return the record of a run and one of its stages; None: its main system's last. Raises ValueError or
-    FileNotFoundError if there is no such stage, or it is not finished."""
+def finished_stage(run: RunFolder) -> tuple[RunRecord, PlannedStage]:
+    """Return the record of a run and its main system's last stage. Raises FileNotFoundError if it is not finished."""
     record = read_record(run)
-    plan = record.plan
-    planned = plan[plan.main[-1] if name is None else name]
+    planned = record.plan[record.plan.main[-1]]
     if not is_regular(run.model(planned.name)):
         raise FileNotFoundError(f"{run.path} has no finished {planned.name}; continue with: {resuming_command(run)}")
     return record, planned
 
 
+def chosen_stage(run: RunFolder, plan: RunPlan, name: str | None = None) -> tuple[PlannedStage, str]:
+    """Return the stage whose model commands take, and a note unless it is finished and the one that is expected.
+
+    It is the stage of this name, or else the last finished one of the main system, or else the one that was trained
+    last. Raises ValueError if the run has no such stage, and FileNotFoundError if nothing of it was kept yet.
+    """
+    wanted = plan.main[-1] if name is None else plan[name].name
+    names = plan.main if name is None else (wanted,)
+    kept = [each for each in names if run.newest(each) is not None]
+    finished = [each for each in kept if is_regular(run.model(each))]
+    if not kept:
+        raise FileNotFoundError(
+            f"{run.path} has no finished {wanted}, and no checkpoint; continue with: {resuming_command(run)}"
+        )
+    planned = plan[(finished or kept)[-1]]
+    if planned.name not in finished:
+        iteration = iteration_of(run.checkpoints(planned.name)[-1])
+        progress = f"after iteration {iteration:,} of {planned.stage.iterations:,}"
+        return planned, f"{planned.name} is not finished: this is its checkpoint {progress}"
+    if planned.name == wanted:
+        return planned, ""
+    return planned, f"{wanted} is not finished: this is {planned.name}, the last finished model"
+
+
+def trained_model(run: RunFolder, planned: PlannedStage, load_scene: Callable[[], Scene | None]) -> Model:
+    """Return the model of a stage of which something was kept. A checkpoint has no cameras, so that the scene is read.
+    Raises FileNotFoundError if the scene is missing, and ValueError if a file cannot be read."""
+    if is_regular(run.model(planned.name)):
+        return load_model(run.model(planned.name))
+    path = run.checkpoints(planned.name)[-1]
+    scene = load_scene()
+    if scene is None:
+        raise FileNotFoundError(f"{path} has no cameras, and the scene that has them is missing")
+    return load_checkpoint(path, system=type(planned.system)).model_in(scene)
+
+
 def open_source(path: Path, name: str | None = None, edit: Path | None = None) -> Source:
-    """Open a run folder or a file of any format that `load_splats` reads. `name` is a model of a run, as `a2tg info`
-    prints it; None: the last one of its main system. `edit` is the file of an edit that is applied to the model. Raises
-    FileNotFoundError if there is no such file, or the run's stage is not finished, and ValueError if it cannot be
-    read."""
+    """Open a run folder or a file of any format that `load_splats` reads.
+
+    Args:
+      path: the folder or file.
+      name: model of a run, as `a2tg info` prints it; None: as `chosen_stage`, with a warning unless that is the last
+        one of its main system.
+      edit: file of an edit that is applied to the model.
+
+    Raises:
+      FileNotFoundError: if there is no such file, or nothing of the run's stage was kept.
+      ValueError: if it cannot be read.
+    """
     change = None if edit is None else load_edit(edit)  # Before a large model is read.
     path = splats_at(path)
     if path.is_dir():
@@ -106,21 +157,28 @@ def open_source(path: Path, name: str | None = None, edit: Path | None = None) -
 
 
 def _source_of_run(run: RunFolder, name: str | None) -> Source:
-    record, planned = finished_stage(run, name)
+    record = read_record(run)
+    planned, note = chosen_stage(run, record.plan, name)
 
+    @functools.cache
     def load_scene() -> Scene | None:
         try:
             return record.scene.load()
         except FileNotFoundError:  # A run is worth showing without its photographs.
             return None
 
-    path = run.model(planned.name)
+    model = trained_model(run, planned, load_scene)
+    is_finished = is_regular(run.model(planned.name))
+    if note:
+        advice = "; `model` NAME takes another one's newest checkpoint" if is_finished else ""
+        warnings.warn(f"{note}{advice}", stacklevel=3)
     return Source(
-        model=load_model(path),
+        model=model,
         title=f"{record.scene.name} · {planned.name}",
+        note="" if is_finished else note,
         settings=settings_of(planned.system),
         load_scene=load_scene,
-        path=path,
+        path=run.newest(planned.name) or run.model(planned.name),
         system=planned.system,
     )
 
@@ -203,7 +261,7 @@ def write_first_stage(run: RunFolder, record: RunRecord, splats: Model, scene: S
     appearance = new_appearance(template, gaussians, system)
     if shapes is not None:
         appearance = appearance.with_shapes(shapes)
-    model = Model(gaussians, appearance, background=BACKGROUNDS[system.background], origin=scene.origin)
+    model = Model(gaussians, appearance, background=system.background_color, origin=scene.origin)
     # No system in the header: none trained it, so that resuming has no options to compare.
     save_model(run.own(run.model(planned.name)), model, {"init": record.init})
     write_history(run.own(run.history(planned.name)), History.empty())

@@ -86,6 +86,8 @@ class RunResult:
     """Results by the names of their stages."""
     is_lpips_kept: bool = False
     """Whether LPIPS is from an earlier measurement of the same models."""
+    note: str = ""
+    """What the main model is, if the main system is not finished (`model_source.chosen_stage`)."""
 
     @property
     def main(self) -> str:
@@ -96,7 +98,7 @@ class RunResult:
     def before(self) -> list[str]:
         """The stage that the main model started from, if it has one."""
         start = self.plan[self.main].start
-        return [] if start is None else [start.name]
+        return [start.name] if start is not None and start.name in self.models else []
 
     @property
     def compared(self) -> list[str]:
@@ -215,7 +217,7 @@ def summary_text(result: RunResult, width: int | None = None) -> str:
         if budget is not None and name in result.models:
             used = result.models[name].num_bytes
             lines.append(f"{name} takes {used:,} bytes of its budget of {budget:,} ({100 * used / budget:.2f} %)")
-    lines += learning_lines(result)
+    lines += warning_lines(result)
     photographs = photographs_line(result)
     if photographs:
         lines.append(photographs)
@@ -235,14 +237,15 @@ def bytes_compared(result: RunResult, name: str) -> str:
     return f"with {times} times its bytes ({megabytes(main)} MB and {megabytes(other)} MB)"
 
 
-def learning_lines(result: RunResult) -> list[str]:
-    """Return a warning for each finished model that is no better than one flat colour per training view."""
-    return [
-        f"{name} did not learn: {model.train.psnr:.1f} dB on its training views, where one flat colour per view "
-        f"reaches {model.train.flat_psnr:.1f} dB"
-        for name, model in result.models.items()
-        if not model.train.has_learned
-    ]
+def warning_lines(result: RunResult) -> list[str]:
+    """Return what the main model is if training is not finished, and a warning for each model that is no better than
+    one flat colour per training view."""
+    lines = [result.note] if result.note else []
+    for name, model in result.models.items():
+        if not model.train.has_learned:
+            flat = f"where one flat colour per view reaches {model.train.flat_psnr:.1f} dB"
+            lines.append(f"{name} did not learn: {model.train.psnr:.1f} dB on its training views, {flat}")
+    return lines
 
 
 def photographs_line(result: RunResult) -> str:
@@ -368,7 +371,7 @@ def write_report(
         result=result,
         main=main,
         held_out=held_out,
-        warnings=learning_lines(result),
+        warnings=warning_lines(result),
         photographs=photographs_line(result),
         gains=[(name, bytes_compared(result, name), gain) for name, gain in result.gains.items()],
         device=jax.devices()[0].platform.upper(),

@@ -17,15 +17,17 @@ import numpy as np
 
 from a2tg_jax import (
     Evaluation,
+    History,
     Model,
+    Origin,
     Renderer,
     Scene,
     System,
     View,
     align_poses,
     evaluate,
+    load_checkpoint,
     load_lpips,
-    load_model,
     view_image,
 )
 from a2tg_jax.base.atomic import write_whole
@@ -48,32 +50,35 @@ from a2tg_jax.results.images import (
     side_by_side,
     to_uint8,
 )
-from a2tg_jax.results.model_source import settings_of
-from a2tg_jax.results.plan import RunPlan
-from a2tg_jax.results.record import read_record
+from a2tg_jax.results.model_source import chosen_stage, settings_of, trained_model
+from a2tg_jax.results.plan import PlannedStage, RunPlan
+from a2tg_jax.results.record import is_finished, read_record
 from a2tg_jax.results.report import Comparison, ModelResult, RunResult, metrics_json, per_view_json, write_report
 from a2tg_jax.results.stage_training import check_held_out
-from a2tg_jax.training.corrections import learned
 from a2tg_jax.web.page import viewer_html_with
 
 REPORTED_VIEWS = 4
+MOST_READABLE = 100
+"""Largest number of numbers of a correction in corrections.json."""
 
 
 def evaluate_run(run: RunFolder, scene: Scene | None = None, *, lpips_weights: Path | None = None) -> RunResult:
-    """Measure the finished models of a run, and write the run folder's metrics, pictures and report. A replaced run is
-    deleted once all stages are trained.
+    """Measure the finished models of a run, or else its newest checkpoint, and write the run folder's metrics, pictures
+    and report. A replaced run is deleted once all stages are trained.
 
     Without `lpips_weights`, a weights file, earlier values of the same models are kept. Raises FileNotFoundError as
-    `finished_stages`, or if the scene or the weights are missing, and ValueError as `check_held_out`.
+    `chosen_stage` and `finished_stages`, or if scene or weights are missing, and ValueError as `check_held_out`.
     """
     record = read_record(run)
     plan = record.plan
-    models = {name: load_model(run.model(name)) for name in finished_stages(run, plan)}
+    planned, note = chosen_stage(run, plan)
+    names = finished_stages(run, plan) or [planned.name]
     scene = scene or record.scene.load()
+    models = {name: trained_model(run, plan[name], lambda: scene) for name in names}
     # Before minutes of measuring.
     for name, model in models.items():
         check_held_out(model, scene, run.model(name))
-    histories = {name: read_history(run.history(name)) for name in models}
+    histories = {name: trained_history(run, plan[name]) for name in names}
     results = {}
     for name, model in models.items():
         results[name] = ModelResult(
@@ -84,16 +89,16 @@ def evaluate_run(run: RunFolder, scene: Scene | None = None, *, lpips_weights: P
             num_published_bytes=model.num_published_bytes,
             num_padding_bytes=model.num_padding_bytes,
             seconds=histories[name].last_seconds,
-            sha256=sha256_of(run.model(name)),
+            sha256=sha256_of(run.newest(name) or run.model(name)),
         )
     if lpips_weights is None:
         results = _with_kept_lpips(run, results)
-    result = RunResult(scene.name, record, plan, results, is_lpips_kept=lpips_weights is None)
+    result = RunResult(scene.name, record, plan, results, is_lpips_kept=lpips_weights is None, note=note)
     write_json(run.own(run.metrics), metrics_json(result))
     write_json(run.own(run.per_view), per_view_json(result))
     for name, model in models.items():
         if model.origin is not None and model.origin.corrections:  # exposure [3, 4] = [A | b] and pose [6] by view
-            write_json(run.own(run.corrections(name)), learned(model.origin))
+            write_json(run.own(run.corrections(name)), learned_corrections(model.origin))
     main = models[result.main]
     save_ply(run.own(run.point_cloud), main, world="upright")
     # Browsers cannot show subclasses of Appearance.
@@ -106,9 +111,16 @@ def evaluate_run(run: RunFolder, scene: Scene | None = None, *, lpips_weights: P
     comparisons = _write_sheets(run, result, models, scene)
     write_report(run, result, comparisons, figures, is_split_by_number=is_split_by_number(record.scene, scene))
     # Until then, the replaced run is the only one with all its models.
-    if len(models) == len(plan.names):
+    if is_finished(run, record):
         drop_old(run)
     return result
+
+
+def trained_history(run: RunFolder, planned: PlannedStage) -> History:
+    """Return the history of a stage that is finished, or of its newest checkpoint."""
+    if run.model(planned.name).is_file():
+        return read_history(run.history(planned.name))
+    return load_checkpoint(run.checkpoints(planned.name)[-1], system=type(planned.system)).history
 
 
 def is_split_by_number(source: SceneSource, scene: Scene) -> bool:
@@ -126,12 +138,10 @@ def check_weights(lpips_weights: Path | None) -> None:
 
 
 def finished_stages(run: RunFolder, plan: RunPlan) -> list[str]:
-    """Return the names of the stages with models. Raises FileNotFoundError if there are none, or the model from which a
-    later stage was trained is missing."""
+    """Return the names of the stages with models. Raises FileNotFoundError if the model from which a later stage was
+    trained is missing."""
     names = [name for name in plan.names if run.model(name).is_file()]
-    if not names:
-        raise FileNotFoundError(f"{run.path} has no finished stage yet; continue with: {resuming_command(run)}")
-    needed = {plan.main[0]}
+    needed = {plan.main[0]} if names else set()
     for name in names:
         start = plan[name].start
         if start is not None:
@@ -235,3 +245,16 @@ def _write_sheets(run: RunFolder, result: RunResult, models: Mapping[str, Model]
             crop = largest_gain(photograph, renders[0], renders[-1]) if len(renders) > 1 else None
             reported.append(Comparison.of(view.name, images, captions, crop))
     return reported
+
+
+def learned_corrections(origin: Origin) -> Mapping[str, Mapping[str, list[float]]]:
+    """Return the corrections of each training photograph, as lists of numbers: name → correction → row.
+
+    Rows of more than `MOST_READABLE` numbers are left out.
+    """
+    readable = {name: rows for name, rows in origin.corrections.items() if rows[0].size <= MOST_READABLE}
+    by_photograph = {}
+    for index, name in enumerate(origin.names):
+        if not origin.is_test[index]:
+            by_photograph[name] = {correction: rows[index].tolist() for correction, rows in readable.items()}
+    return by_photograph

@@ -20,7 +20,7 @@ import numpy as np
 
 from a2tg_jax import DivergedError, Scene, Session, fit_stage, load_checkpoint, load_model
 from a2tg_jax.host import signals
-from a2tg_jax.parallel import any_process, broadcast, check_batch_size, leave
+from a2tg_jax.parallel import any_process, broadcast, leave
 from a2tg_jax.results.record import RunRecord
 from a2tg_jax.scene import views_by_kind
 
@@ -31,7 +31,7 @@ COMPARED = ("options", "`devices`", "views, cameras or points")
 def check_batch_sizes(record: RunRecord, session: Session) -> None:
     """Raise ValueError if the devices of all processes cannot share the views of a step evenly."""
     for system in record.systems.values():
-        check_batch_size(system.batch_size, session.num_devices)
+        session.check_batch_size(system.batch_size)
 
 
 def check_alike(record: RunRecord, scene: Scene, session: Session) -> None:

@@ -8,7 +8,17 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-from a2tg_jax import Checkpoint, DivergedError, Scene, Session, StageResult, fit_stage, save_checkpoint, save_model
+from a2tg_jax import (
+    Checkpoint,
+    DivergedError,
+    Progress,
+    Scene,
+    Session,
+    StageResult,
+    fit_stage,
+    save_checkpoint,
+    save_model,
+)
 from a2tg_jax.base.machine import Devices
 from a2tg_jax.finish.tuning import ITERATIONS
 from a2tg_jax.host import signals
@@ -16,7 +26,7 @@ from a2tg_jax.host.errors import error_text
 from a2tg_jax.host.training_bar import ProgressBar
 from a2tg_jax.io.formats import load_splats
 from a2tg_jax.model_file import number_in_file
-from a2tg_jax.results.commands import file_command, resuming_command
+from a2tg_jax.results.commands import file_command, resuming_command, viewing_command
 from a2tg_jax.results.compression import SUFFIX, compress
 from a2tg_jax.results.folder import RunFolder, check_free, claimed, iteration_of, put_back_old, set_aside
 from a2tg_jax.results.forecast import checked_forecast, doubts_about, room_for_photographs, time_after
@@ -30,10 +40,8 @@ from a2tg_jax.results.report import RunResult
 from a2tg_jax.results.run_evaluation import check_weights, evaluate_run
 from a2tg_jax.results.run_processes import check_alike, leave_others, send_stage
 from a2tg_jax.results.stage_training import check_finished, train_stage
-from a2tg_jax.training.loop import IsStopped, Watch, never, unwatched
 from a2tg_jax.training.registry import system_to_dict
-from a2tg_jax.training.reports import Progress
-from a2tg_jax.training.start import check_loss_data, check_start
+from a2tg_jax.training.start import check_points
 
 LESS_MEMORY = (
     "close other programs, or start another run with a larger `downscale`, or a smaller `memory_budget` or `batch_size`"
@@ -41,13 +49,13 @@ LESS_MEMORY = (
 """Advice for trainings that run out of memory."""
 MOST_RESTORED = 5
 """Largest number of restorations of a diverged stage, each with another order of the views."""
-Watched = Callable[[Scene], AbstractContextManager[Watch]]
-"""Function that returns the watcher of a scene's training."""
+Watched = Callable[[Scene], AbstractContextManager[Callable[..., float]]]
+"""Function that returns the watcher of a scene's training (`Session.watch`)."""
 
 
-def unseen(scene: Scene) -> AbstractContextManager[Watch]:
+def unseen(scene: Scene) -> AbstractContextManager[Callable[..., float]]:
     """Watch nothing."""
-    return contextlib.nullcontext(unwatched)
+    return contextlib.nullcontext(lambda run, is_stopped: 0.0)
 
 
 def warn(doubts: Sequence[str]) -> None:
@@ -97,9 +105,10 @@ def begin_run(record: RunRecord, out: Path, options: RunOptions) -> RunResult:
     check_output(out)
     scene = record.scene.load(room_for_photographs(options.max_memory))
     for system in record.systems.values():
-        check_loss_data(scene.train, system.all_stages())
+        for stage in system.all_stages():
+            stage.check_views(scene.train)
         if given is None or system is not record.options:
-            check_start(scene, system)
+            check_points(scene, system)
     doubts = doubts_about(scene, record)
     if doubts:
         options.confirm(doubts)
@@ -166,15 +175,14 @@ def _advice(run: RunFolder, options: RunOptions) -> str:
 
 
 def how_to_go_on(run: RunFolder, devices: Devices | None = None) -> str:
-    """Return the path of the newest checkpoint, or else model, and the command that resumes, as `resuming_command`."""
-    names = read_record(run).plan.names
+    """Return the newest file of the training and the command that shows it, and the command that resumes, as
+    `resuming_command`."""
     kept = "there is no checkpoint yet"
-    for name in names:
-        if run.model(name).is_file():
-            kept = f"the last model is {run.model(name)}"
-    for name in names:
-        for path in run.checkpoints(name):
-            kept = f"the last checkpoint is {path}"
+    for name in read_record(run).plan.names:
+        path = run.newest(name)
+        if path is not None:
+            what = "model" if path == run.model(name) else "checkpoint"
+            kept = f"the last {what} is {path}; show it with: {viewing_command(run, name)}"
     return f"{kept}; continue with: {resuming_command(run, devices)}"
 
 
@@ -196,7 +204,9 @@ def _write_file(run: RunFolder, record: RunRecord, max_bytes: int, scene: Scene,
 # Training of the stages
 
 
-def train_run(run: RunFolder, scene: Scene, options: RunOptions, *, is_stopped: IsStopped = never) -> None:
+def train_run(
+    run: RunFolder, scene: Scene, options: RunOptions, *, is_stopped: Callable[[], bool] = lambda: False
+) -> None:
     """Train every stage of the run's record that is not finished yet, from its newest checkpoint. When a stage ends,
     its history and its model are written, and its checkpoints deleted.
 

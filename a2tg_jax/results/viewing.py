@@ -23,8 +23,7 @@ from a2tg_jax.core.origin import Color
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.results.images import to_uint8
 from a2tg_jax.results.model_source import Source
-from a2tg_jax.training.loop import IsStopped, StageRun
-from a2tg_jax.training.stage import BACKGROUNDS
+from a2tg_jax.training.loop import StageRun
 from a2tg_jax.web.page import (
     PHOTOGRAPHS_NAME,
     SCENE_NAME,
@@ -99,7 +98,7 @@ def routes_of(source: Source) -> dict[str, Route]:
 
 
 class LiveView:
-    """View of a training, called between its steps (`training.loop.Watch`); `now` is a clock in seconds."""
+    """View of a training, called between its steps (`Session.watch`); `now` is a clock in seconds."""
 
     def __init__(self, scene: Scene, title: str, now: Callable[[], float] = time.perf_counter):
         self._scene = scene
@@ -114,7 +113,7 @@ class LiveView:
         self._scene_bytes: bytes | None = None
         self._status: dict[str, Any] = {"version": 0, "message": "", "stage": ""}
 
-    def __call__(self, run: StageRun, is_stopped: IsStopped) -> float:
+    def __call__(self, run: StageRun, is_stopped: Callable[[], bool]) -> float:
         """Record metrics, take a snapshot when one is due, and wait while the training is paused."""
         if self._now() >= self._noted + NOTED_SECONDS:
             self._note(run)
@@ -132,7 +131,7 @@ class LiveView:
         # Copied now: the next step donates the state's buffers.
         model = dataclasses.replace(
             jax.device_get(run.state.model),
-            background=BACKGROUNDS[run.system.background],
+            background=run.system.background_color,
             origin=self._scene.origin,
         )
         self._due = math.inf

@@ -141,7 +141,7 @@ class A2tg(TwoStages):
                         f"0: leave it out; got {value}"
                     )
 
-    def check_number(self, num: int) -> None:
+    def check_initial_number(self, num: int) -> None:
         """Check that the texture budget has room for the Gaussians of the first stage."""
         option = "initial_gaussians"
         if self.densify.cap:
@@ -151,7 +151,7 @@ class A2tg(TwoStages):
 
     def check_given_number(self, num: int) -> None:
         """Check that the memory budget or the texture budget has room for the given Gaussians."""
-        # At most one of them is set, as `stages` checks; given Gaussians do not grow as `check_number` expects.
+        # At most one of them is set, as `stages` checks; given Gaussians do not grow as `check_initial_number` expects.
         if self.texture.budget_mb is None:
             super().check_given_number(num)
         self._check_budget(num, "raise it")

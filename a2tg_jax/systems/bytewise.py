@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.appearance import Appearance, Bands, TexelRates, Texture, TextureOptions
@@ -115,11 +115,11 @@ class Bytewise(TwoStages):
 
     def _num_kept(self) -> int:
         """Return the number of Gaussians that fit with degrees and texels."""
-        return math.floor(self._num_bytes() * (1 - self._share) / self._own_bytes)
+        return math.floor(self._num_bytes() * (1 - self._share) / self._bytes_each)
 
     def _num_bytes(self) -> int:
         """Return the bytes of the finished model."""
-        return self.densify.cap * self._own_bytes if self.budget_bytes is None else self.budget_bytes
+        return self.densify.cap * self._bytes_each if self.budget_bytes is None else self.budget_bytes
 
     def _megabytes_before_texels(self) -> float:
         """Return the megabytes of Gaussians and degrees."""
@@ -131,7 +131,7 @@ class Bytewise(TwoStages):
         return "densify.cap" if self.memory_budget is None else "memory_budget"
 
     @property
-    def _own_bytes(self) -> int:
+    def _bytes_each(self) -> int:
         """Bytes of a Gaussian without degrees and texels."""
         return int(bytes_per_gaussian(self.base_degree, bool(self.kernel_rate)))
 
@@ -147,23 +147,32 @@ class Bytewise(TwoStages):
             check_number(name, getattr(self, name), least=0, most=1)
         for name in ("fading_weight", "kernel_rate", "view_dependence_rate", "texel_rate"):
             check_number(name, getattr(self, name), least=0)
-        view = self.view_dependence
-        details = self.details
-        by_shares = "the shares decide"
-        decided: tuple[tuple[str, Any, str, str], ...] = (
-            *(("details", details, name, by_shares) for name in ("select", "fraction", "threshold", "budget_mb")),
-            ("view_dependence", view, "budget_mb", by_shares),
-            ("place", self.place, "cap", f"{self._limit} decides"),
-        )
-        for path, event, name, reason in decided:
-            if getattr(event, name) != getattr(type(event), name):
-                raise ValueError(
-                    f"{path}.{name} must stay {getattr(type(event), name)!r}, because {reason}; got "
-                    f"{getattr(event, name)!r}"
-                )
+        self._check_decided()
+        self._check_shares()
+        self._check_times()
+
+    def _check_decided(self) -> None:
+        """Raise ValueError if an option is set that the size of the model and the shares decide."""
+        decided = {
+            "details": ("select", "fraction", "threshold", "budget_mb"),
+            "view_dependence": ("budget_mb",),
+            "place": ("cap",),
+        }
+        for path, names in decided.items():
+            event = getattr(self, path)
+            for name in names:
+                usual = getattr(type(event), name)
+                number = getattr(event, name)
+                if number != usual:
+                    raise ValueError(
+                        f"{path}.{name} must stay {usual!r}, as {self._limit} and the shares decide; got {number!r}"
+                    )
+
+    def _check_shares(self) -> None:
+        """Raise ValueError unless the shares leave bytes for Gaussians, and something can take them."""
         if self.texture_share:
-            check_number("details.cap", details.cap, least=2)
-        elif details != type(self).details:
+            check_number("details.cap", self.details.cap, least=2)
+        elif self.details != type(self).details:
             raise ValueError("details has no effect while texture_share is 0: set that too, to 0.02 for example")
         if self._share >= 1:
             raise ValueError(
@@ -175,11 +184,17 @@ class Bytewise(TwoStages):
                 f"view_dependence_share must be 0 where all Gaussians have the highest degree, {self.sh_degree}, "
                 f"already: set it so, or lower base_degree; got {self.view_dependence_share}"
             )
-        shares = {"view_dependence": self.view_dependence_share, "details": self.texture_share}
+        if self._num_gaussians() < 2 or self._num_kept() < 2:
+            size = self.densify.cap if self.memory_budget is None else self.memory_budget
+            raise ValueError(f"{self._limit} must leave room for 2 Gaussians with degrees and textures; got {size}")
+
+    def _check_times(self) -> None:
+        """Raise ValueError unless each share is spent in the second stage, on degrees before textures."""
         times = {}
-        for path, share in shares.items():
-            if share:
-                times[path] = getattr(self, path).times(self.stage2_iterations)
+        if self.view_dependence_share:
+            times["view_dependence"] = self.view_dependence.times(self.stage2_iterations)
+        if self.texture_share:
+            times["details"] = self.details.times(self.stage2_iterations)
         for path, of_event in times.items():
             if not of_event:
                 raise ValueError(f"{path}.at must hold fractions at which its share of the bytes is spent; it is empty")
@@ -188,9 +203,6 @@ class Bytewise(TwoStages):
                 "view_dependence.at must be over when textures begin to take the rest of the bytes, at "
                 f"details.at {shortened(self.details.at)}; got {shortened(self.view_dependence.at)}"
             )
-        if self._num_gaussians() < 2 or self._num_kept() < 2:
-            size = self.densify.cap if self.memory_budget is None else self.memory_budget
-            raise ValueError(f"{self._limit} must leave room for 2 Gaussians with degrees and textures; got {size}")
 
     def check_given_number(self, num: int) -> None:
         """Check that the given Gaussians leave bytes for degrees and textures."""
@@ -198,7 +210,7 @@ class Bytewise(TwoStages):
         if not self._share:
             return
         megabytes = self._megabytes_before_texels() if self.view_dependence_share else self._num_bytes() / MEGABYTE
-        most = bytes_of(megabytes) // self._own_bytes
+        most = bytes_of(megabytes) // self._bytes_each
         if num > most:
             raise ValueError(
                 f"{self._limit} has room for {most:,} Gaussians when the stage 'details' begins, and {num:,} are "

@@ -2,7 +2,6 @@
 
 from a2tg_jax.training.checkpoint import (
     Checkpoint as Checkpoint,
-    History as History,
     Interrupted as Interrupted,
     load_checkpoint as load_checkpoint,
     save_checkpoint as save_checkpoint,
@@ -14,6 +13,7 @@ from a2tg_jax.training.fitting import (
     fit as fit,
     fit_stage as fit_stage,
 )
+from a2tg_jax.training.history import History as History
 from a2tg_jax.training.loop import Session as Session
 from a2tg_jax.training.options import LossConfig as LossConfig, System as System, like as like
 from a2tg_jax.training.registry import SYSTEMS as SYSTEMS, find_system as find_system

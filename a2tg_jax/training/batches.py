@@ -167,17 +167,24 @@ class PhotoStore:
         self._keeps_rays = plan.keeps_rays
         self.num_ahead = plan.num_ahead
         self._rays: dict[Kind, Array] = {}
-        self._stacks: dict[Kind, Photographs] = {}
-        self._of_kind: dict[Kind, list[int]] = {}
-        """Views of each kind, in the order of its stack."""
-        for index, kind in enumerate(order.kinds):
-            self._of_kind.setdefault(kind, []).append(index)
-        self._places: dict[int, int] = {}
-        for indices in self._of_kind.values():
-            self._places.update(zip(indices, range(len(indices)), strict=True))
         self._ahead = Ahead(self._read, self.num_ahead)
         # All processes must launch the same program, so one without room makes all stream.
         self.is_resident = not any_process(mesh, not plan.is_resident)
+        self._stacks: dict[Kind, Photographs] = {}
+        """All photographs of each kind, if they stay on the device."""
+        self._places: dict[int, int] = {}
+        """Place of each view in the stack of its kind."""
+        if self.is_resident:
+            of_kind: dict[Kind, list[int]] = {}
+            for index, kind in enumerate(order.kinds):
+                alike = of_kind.setdefault(kind, [])
+                self._places[index] = len(alike)
+                alike.append(index)
+            for kind, alike in of_kind.items():
+                stack = self._read(alike)
+                self._stacks[kind] = self._placed(kind, stack)
+        self._here = views_here(mesh, len(order.indices(1)))
+        """Places in a batch of the views that this process draws."""
 
     def batch(self, iteration: int) -> tuple[Photographs, Array | np.ndarray | None]:
         """Return photographs of one kind, and the int32 indices of the iteration's among them; None if all are the
@@ -186,16 +193,19 @@ class PhotoStore:
         Raises:
           ValueError, OSError: if a photograph that was not copied has gone, has changed or cannot be read.
         """
-        indices = self._order.indices(iteration)
+        indices = self._indices_here(iteration)
         kind = self._order.kinds[indices[0]]
         if not self.is_resident:
             following = range(iteration, min(iteration + self.num_ahead, self._last) + 1)
-            return self._placed(kind, self._ahead.first({key: self._order.indices(key) for key in following})), None
-        if kind not in self._stacks:
-            views = [self._views[index] for index in self._of_kind[kind]]
-            self._stacks[kind] = self._placed(kind, stack_views(views, self._views, has_depths=self._has_depths))
-        places = np.asarray([self._places[indices[place]] for place in views_here(self._mesh, len(indices))], np.int32)
-        return self._stacks[kind], of_views(self._mesh, places)
+            batch = self._ahead.first({later: self._indices_here(later) for later in following})
+            return self._placed(kind, batch), None
+        places = [self._places[index] for index in indices]
+        return self._stacks[kind], of_views(self._mesh, np.asarray(places, np.int32))
+
+    def _indices_here(self, iteration: int) -> tuple[int, ...]:
+        """Return the views of an iteration that this process draws."""
+        indices = self._order.indices(iteration)
+        return tuple(indices[place] for place in self._here)
 
     def _placed(self, kind: Kind, batch: Photographs) -> Photographs:
         """Return photographs of a kind on the devices, with the rays of their lens, which stay there if the rays of
@@ -213,9 +223,7 @@ class PhotoStore:
         return jax.device_put(tree) if self._mesh is None else everywhere(self._mesh, tree)
 
     def _read(self, indices: Sequence[int]) -> Photographs:
-        """Return the photographs of an iteration that this process draws."""
-        views = [self._views[indices[place]] for place in views_here(self._mesh, len(indices))]
-        return stack_views(views, self._views, has_depths=self._has_depths)
+        return stack_views([self._views[index] for index in indices], self._views, has_depths=self._has_depths)
 
     def close(self) -> None:
         """End the threads."""

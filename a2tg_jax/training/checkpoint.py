@@ -2,7 +2,8 @@
 
 import dataclasses
 import os
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -23,90 +24,15 @@ from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import combine, partition
 from a2tg_jax.core.table import map_rows
 from a2tg_jax.model import Model, check_model
-from a2tg_jax.training.corrections import initial_corrections
+from a2tg_jax.scene import Scene, View
+from a2tg_jax.training.corrections import check_corrections, corrected_origin
+from a2tg_jax.training.history import COLUMNS, History, check_history
 from a2tg_jax.training.options import System
 from a2tg_jax.training.recorded_views import RecordedViews
 from a2tg_jax.training.registry import system_from_dict, system_to_dict
 from a2tg_jax.training.stage import Stage
-from a2tg_jax.training.step import EXPLODED, TrainState, initial_state
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class History(NamedFields):
-    """Log of a training, one entry every 10 iterations; arrays of one length."""
-
-    stage: np.ndarray
-    """Stage, from 1."""
-    iteration: np.ndarray
-    """Iteration within its stage, from 1."""
-    loss: np.ndarray
-    """Loss of that iteration, the sum of `terms`."""
-    psnr: np.ndarray
-    """PSNR of the training views of that iteration, in dB."""
-    num_gaussians: np.ndarray
-    """Live Gaussians."""
-    megabytes: np.ndarray
-    """Reported memory in 10⁶ bytes."""
-    seconds: np.ndarray
-    """Training time of the stage so far."""
-    terms: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
-    """Summands of the loss, weighted, by name: l1, ssim, and other terms of the stage. NaN where there is none."""
-
-    @staticmethod
-    def empty() -> "History":
-        counts = np.zeros(0, np.int64)
-        values = np.zeros(0)
-        return History(counts, counts, values, values, counts, values, values)
-
-    def __repr__(self) -> str:
-        rows = counted(len(self.iteration), "row")
-        if not len(self.iteration):
-            return f"History({rows})"
-        return f"History({rows} to iteration {self.iteration[-1]:,} of stage {self.stage[-1]}, {self.psnr[-1]:.2f} dB)"
-
-    def to_dict(self) -> dict[str, np.ndarray]:
-        """Return the columns by name, as `pandas.DataFrame` takes them; loss terms as loss_l1 and so on."""
-        columns = {name: getattr(self, name) for name in COLUMNS}
-        return columns | {f"{TERM}{name}": values for name, values in self.terms.items()}
-
-    @property
-    def last_seconds(self) -> float:
-        return float(self.seconds[-1]) if len(self.seconds) else 0.0
-
-    @staticmethod
-    def of_rows(rows: Sequence[Mapping[str, float]]) -> "History":
-        """Return the history of rows, which map column names to values; NaN for a loss term that a row lacks."""
-        names = dict.fromkeys([*COLUMNS, *(name for row in rows for name in row)])
-        empty = History.empty().to_dict()
-        columns = {}
-        for name in names:
-            dtype = empty[name].dtype if name in empty else np.float64
-            columns[name] = np.asarray([row.get(name, np.nan) for row in rows], dtype)
-        return History.of_columns(columns)
-
-    @staticmethod
-    def of_columns(columns: Mapping[str, np.ndarray]) -> "History":
-        """Return the history of columns, the inverse of `to_dict`."""
-        terms = {name.removeprefix(TERM): column for name, column in columns.items() if name not in COLUMNS}
-        fields: dict[str, Any] = {name: columns[name] for name in COLUMNS}
-        return History(**fields, terms=terms)
-
-    def followed_by(self, other: "History") -> "History":
-        """Return this history, continued by another."""
-        first = self.to_dict()
-        second = other.to_dict()
-        missing = np.full(len(self.iteration), np.nan)
-        other_missing = np.full(len(other.iteration), np.nan)
-        columns = {}
-        for name in first | second:
-            columns[name] = np.concatenate([first.get(name, missing), second.get(name, other_missing)])
-        return History.of_columns(columns)
-
-
-COLUMNS = tuple(field.name for field in dataclasses.fields(History) if field.name != "terms")
-"""Columns that each history has."""
-TERM = "loss_"
-"""Beginning of the names of the others."""
+from a2tg_jax.training.start import continued_state, copied, initial_state, with_room
+from a2tg_jax.training.step import EXPLODED, TrainState
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -146,6 +72,12 @@ class Checkpoint(NamedFields):
     def model(self) -> Model:
         """The Gaussians that exist, and what they show."""
         return self.state.model.live
+
+    def model_in(self, scene: Scene) -> Model:
+        """Return the model as of a finished stage: with the scene's cameras, as corrected so far, and a background."""
+        corrections = self.system.all_stages()[self.stage].corrections
+        origin = corrected_origin(scene.origin, corrections, self.state.corrections)
+        return dataclasses.replace(self.model, background=self.system.background_color, origin=origin)
 
     def __repr__(self) -> str:
         at = f"stage {self.stage + 1}"
@@ -232,26 +164,30 @@ def _checkpoint_of(header: dict[str, Any], arrays: dict[str, np.ndarray], system
     stage = stages[index]
     if not isinstance(is_ahead, list) or len(is_ahead) != len(stage.events) or {type(x) for x in is_ahead} - {bool}:
         raise ValueError(f"is_ahead must hold true or false for {len(stage.events)} events; got {shortened(is_ahead)}")
-    # Any leaves: only the paths of the fields count.
-    (gaussians,) = _filled((Gaussians(*range(5)),), arrays)
+    fields: dict[str, Any] = arrays_below(f"{GAUSSIANS}.", arrays)
+    gaussians = Gaussians(**fields)
     check_gaussians(gaussians)
     appearance = with_arrays(stage.appearance, arrays_below(SHOWN, arrays), gaussians.sh_degree)
     gaussians = jax.tree.map(jnp.asarray, gaussians)
     check_appearance(appearance, gaussians)
     model = Model(gaussians, appearance, jnp.zeros((), jnp.int32))
+    # Only the number of names matters for shapes.
+    names = [""] * len(arrays[f"{STATE}[5][0].rows"]) if stage.corrections else []
     # Shapes only; nothing is allocated.
-    expected: TrainState = jax.eval_shape(lambda: initial_state(stage, model, [""]))
+    expected: TrainState = jax.eval_shape(lambda: initial_state(stage, model, names))
     events = (event if ahead else None for event, ahead in zip(expected.events, is_ahead, strict=True))
     expected = dataclasses.replace(expected, events=tuple(events))
+    rest: Any = jax.tree_util.tree_map_with_path(
+        lambda path, _: jnp.asarray(arrays[f"{STATE}{jax.tree_util.keystr(path)}"]), _rest(expected)
+    )
+    moments, num_live, *others = rest
+    state = TrainState(Model(gaussians, appearance, num_live), moments, *others)
+    check_state(state, expected, stage)
     terms = header["terms"]
     if not isinstance(terms, list) or not all(isinstance(name, str) for name in terms):
         raise ValueError(f"terms must be a list of names; got {shortened(terms)}")
-    template = _rest(expected), dict.fromkeys(COLUMNS, 0) | {"terms": dict.fromkeys(terms, 0)}
-    _, (rest, columns) = _filled((gaussians, template), arrays)
-    moments, num_live, *others = jax.tree.map(jnp.asarray, rest)
-    state = TrainState(Model(gaussians, appearance, num_live), moments, *others)
-    history = History(**columns)
-    check_state(state, expected, stage)
+    columns: dict[str, Any] = {name: arrays[f"{HISTORY}[{name!r}]"] for name in COLUMNS}
+    history = History(**columns, terms={name: arrays[f"{HISTORY}['terms'][{name!r}]"] for name in terms})
     check_history(history)
     counts = {name: header[name] for name in ("num_restored", "num_refused")}
     for name, count in counts.items():
@@ -266,10 +202,13 @@ def _checkpoint_of(header: dict[str, Any], arrays: dict[str, np.ndarray], system
 
 LONGEST_DIFFERENCE = 300
 """Largest number of characters of the options that differ from a checkpoint's."""
+GAUSSIANS = "[0]"
+STATE = "[1][0]"
+HISTORY = "[1][1]"
 SHOWN = "shown/"
-"""Prefix of the names of appearance arrays."""
 VIEWS = "views/"
-"""Prefix of the names of arrays about the training views."""
+"""Prefixes of the names of arrays. The first three are paths in (Gaussians, (rest of the state, history)); the others
+are of the appearance, and of records of the training views."""
 
 
 def _rest(state: TrainState) -> tuple[object, ...]:
@@ -280,7 +219,7 @@ def _rest(state: TrainState) -> tuple[object, ...]:
 def _packed(model: Model, moments: AdamState) -> AdamState:
     """Return moments at the capacity that tables get when they are loaded, which may be less than in training."""
     _, rest = partition(model.appearance)
-    rows = np.arange(model.gaussians.num)
+    rows = np.arange(model.num_rows)
 
     def packed(moment: Model) -> Model:
         whole = map_rows(
@@ -293,16 +232,11 @@ def _packed(model: Model, moments: AdamState) -> AdamState:
     return dataclasses.replace(moments, mu=packed(moments.mu), nu=packed(moments.nu))
 
 
-def _filled(template: object, arrays: dict[str, np.ndarray]) -> Any:
-    """Return a tree of the template's structure with the array of its path at each leaf."""
-    return jax.tree_util.tree_map_with_path(lambda path, _: arrays[jax.tree_util.keystr(path)], template)
-
-
 def check_state(state: TrainState, expected: TrainState, stage: Stage) -> None:
     """Raise ValueError, naming the leaf, unless the state of a file, whose model is valid, has the shapes and dtypes of
     the expected one."""
     check_like("state.model.num_live", state.model.num_live, expected.model.num_live)
-    for name in ("moments", "events", "iteration", "status"):
+    for name in ("moments", "events", "iteration", "status", "corrections"):
         check_like(f"state.{name}", getattr(state, name), getattr(expected, name))
     check_model(state.model)
     check_count("state.iteration", state.iteration, stage.iterations)
@@ -310,11 +244,6 @@ def check_state(state: TrainState, expected: TrainState, stage: Stage) -> None:
     check_count("state.moments.count", state.moments.count, np.iinfo(np.int32).max)
     check_finite("state.moments.mu", state.moments.mu)
     check_finite("state.moments.nu", state.moments.nu, is_signed=False)
-    # Only the number of names matters for shapes.
-    names = [""] * len(state.corrections[0].rows) if state.corrections else []
-    dtype = state.model.gaussians.means.dtype
-    neutral = jax.eval_shape(lambda: initial_corrections(stage.corrections, names, None, dtype))
-    check_like("state.corrections", state.corrections, neutral)
     for correction in state.corrections:
         check_finite("state.corrections.rows", correction.rows)
         check_finite("state.corrections.mu", correction.moments.mu)
@@ -326,35 +255,8 @@ def check_state(state: TrainState, expected: TrainState, stage: Stage) -> None:
             raise ValueError(f"state.events{jax.tree_util.keystr(path)} must be numbers; some are NaN")
 
 
-def check_history(history: History) -> None:
-    """Raise ValueError, naming the column, unless its columns are numbers of one length.
-
-    dB may be infinite, and loss terms NaN.
-    """
-    columns = {name: np.asarray(column) for name, column in history.to_dict().items()}
-    num = columns["iteration"].shape
-    for name, column in columns.items():
-        if column.ndim != 1 or column.shape != num or column.dtype.kind not in "iuf":
-            raise ValueError(f"history.{name} must be numbers {list(num)}; got {column.dtype} {list(column.shape)}")
-        is_term = name.startswith(TERM)
-        if (np.isnan(column).any() and not is_term) or (name != "psnr" and np.isinf(column).any()):
-            raise ValueError(f"history.{name} must be finite; some are not")
-        if name not in ("loss", "psnr") and not is_term and (column < 0).any():
-            raise ValueError(f"history.{name} must be at least 0; some are below")
-
-
-def check_resume(resume: Checkpoint, system: System, index: int) -> None:
-    """Raise ValueError unless the checkpoint is of that stage of that system, which may have further stages, or of the
-    end of the stage that it continues."""
-    if resume.stage != index:
-        stages = system.all_stages()
-        if resume.stage != index - 1 or not stages[index].continues:
-            raise ValueError(f"the checkpoint is of stage {resume.stage + 1}, but stage {index + 1} was to be resumed")
-        if not resume.is_at_end:
-            raise ValueError(
-                f"the checkpoint is of iteration {resume.iteration:,} of {stages[resume.stage].iterations:,} of stage "
-                f"{resume.stage + 1}, which stage {index + 1} continues: resume that one first"
-            )
+def check_resume(resume: Checkpoint, system: System) -> None:
+    """Raise ValueError, naming the options, unless the checkpoint is of that system, which may have further stages."""
     if resume.system == dataclasses.replace(system, more=system.more[: len(resume.system.more)]):
         return
     trained = type(resume.system)
@@ -377,3 +279,24 @@ def check_resume(resume: Checkpoint, system: System, index: int) -> None:
         f"the checkpoint was made with another configuration ({shortened(differing, LONGEST_DIFFERENCE)}): resume with "
         f"checkpoint.system{advice}"
     )
+
+
+def state_of_checkpoint(
+    resume: Checkpoint, stages: Sequence[Stage], index: int, views: Sequence[View], num_devices: int
+) -> TrainState:
+    """Return the state of a checkpoint of a stage, or, of the end of the stage before, the state before the first
+    iteration. Raises ValueError unless it was trained on these views."""
+    check_corrections(resume.state.corrections, len(views))
+    if resume.views is not None:
+        resume.views.check(views)
+    num = resume.state.model.num_rows
+    if num % num_devices:
+        warnings.warn(
+            f"the checkpoint has {num:,} rows, which {num_devices} devices cannot share evenly: each holds all of them "
+            "until the stage ends",
+            stacklevel=2,
+        )
+    state = copied(resume.state)
+    if resume.stage != index:
+        state = continued_state(stages[index - 1], stages[index], state)
+    return with_room(stages[index], state)

@@ -6,7 +6,7 @@ dataclass that is a pytree of its numbers. V views.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import jax
@@ -21,9 +21,6 @@ from a2tg_jax.core.optim import AdamState, adam_init, adam_update
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.training.returned import check_kept, check_scalar
-
-MOST_READABLE = 100
-"""`learned` leaves out rows of more numbers than this."""
 
 
 class Correction(NamedFields):
@@ -263,19 +260,6 @@ def corrected_origin(origin: Origin, corrections: Sequence[Correction], states: 
         of_view = [jnp.asarray(rows[correction.name][index]) for correction in corrections]
         viewmats[index] = corrected_camera(corrections, of_view, origin.cameras[index]).viewmat
     return dataclasses.replace(origin, viewmats=viewmats, corrections=rows)
-
-
-def learned(origin: Origin) -> Mapping[str, Mapping[str, list[float]]]:
-    """Return the corrections of each training photograph, as lists of numbers: name → correction → row.
-
-    Rows of more than `MOST_READABLE` numbers are left out.
-    """
-    readable = {name: rows for name, rows in origin.corrections.items() if rows[0].size <= MOST_READABLE}
-    by_photograph = {}
-    for index, name in enumerate(origin.names):
-        if not origin.is_test[index]:
-            by_photograph[name] = {correction: rows[index].tolist() for correction, rows in readable.items()}
-    return by_photograph
 
 
 LUMINANCE = (0.299, 0.587, 0.114)

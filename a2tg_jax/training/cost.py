@@ -28,6 +28,7 @@ FURTHER_PROGRAM = 50 * 10**6
 class StageForecast:
     """Forecast of one stage, from shapes alone."""
 
+    name: str
     model_bytes: float
     """Bytes of the model at its largest."""
     num_rows: int
@@ -65,12 +66,12 @@ def forecast_stages(
     appearance = None
     if num_given is not None:
         num = num_given
+        yield StageForecast(stages[0].name, system.initial_bytes * num, num, num_programs=0, whole_bytes=0)
         stages = stages[1:]
-        yield StageForecast(system.initial_bytes * num, num, num_programs=0, whole_bytes=0)
     for stage in stages:
         num = rows_needed(stage, num, system)
         if stage.appearance != appearance:
-            floats = stage.floats_shown(system.initial_sh_degree)
+            floats = stage.floats_shown
             appearance = stage.appearance
             shared = stage.shared_bytes
         model_bytes = BYTES_PER_FLOAT * (own_floats + floats) * num + shared
@@ -82,7 +83,7 @@ def forecast_stages(
         # An event has the old state and the new one; later, the devices get their shares.
         is_changed = any(event.times(stage.iterations) for event in on_host)
         whole = STATES * (2 if is_changed else 1 + 1 / num_devices) * model_bytes
-        yield StageForecast(model_bytes, num, num_programs, whole)
+        yield StageForecast(stage.name, model_bytes, num, num_programs, whole)
         for event in stage.events:
             num = event.num_after(num, stage.iterations)
 
@@ -103,7 +104,7 @@ def check_rows_fit(
     limit = math.inf if devices.processes > 1 else allowed_memory(max_memory, devices.each)
     copies = STATES + 1
     forecasts = list(forecast_stages(scene, system, first=first, num_start=num_start))
-    for stage, forecast in zip(system.all_stages()[first:], forecasts, strict=True):
+    for forecast in forecasts:
         needed = copies * forecast.model_bytes
         if needed <= limit:
             continue
@@ -114,8 +115,8 @@ def check_rows_fit(
             names = "start"
         place = "this machine (its container and ulimit included)" if default_platform() == "cpu" else "the GPU"
         raise ValueError(
-            f"{names} is too large for {place}: stage {stage.name!r} trains up to {forecast.num_rows:,} Gaussians of "
-            f"{forecast.model_bytes / forecast.num_rows:,.0f} bytes, and {copies} copies of them (parameters, "
+            f"{names} is too large for {place}: stage {forecast.name!r} trains up to {forecast.num_rows:,} Gaussians "
+            f"of {forecast.model_bytes / forecast.num_rows:,.0f} bytes, and {copies} copies of them (parameters, "
             f"gradients and two moments) take at least {in_bytes(needed)} of memory, but {in_bytes(limit)} may be "
             f"used: lower it, to a model of less than {in_bytes(limit / copies)}, or allow more with max_memory"
         )

@@ -5,7 +5,8 @@ from collections.abc import Iterator, Sequence
 import jax
 import numpy as np
 
-from a2tg_jax.training.checkpoint import Checkpoint, History
+from a2tg_jax.training.checkpoint import Checkpoint
+from a2tg_jax.training.history import History
 from a2tg_jax.training.step import Attempt
 
 EXPLOSION = 100.0

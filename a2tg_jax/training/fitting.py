@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import os
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -16,14 +17,15 @@ from a2tg_jax.core.budget import LARGEST_SHORTFALL
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.model import Model
 from a2tg_jax.scene import Scene, check_scene
-from a2tg_jax.training.checkpoint import Checkpoint, History
+from a2tg_jax.training.checkpoint import Checkpoint, check_resume
 from a2tg_jax.training.corrections import corrected_origin
 from a2tg_jax.training.cost import check_rows_fit
+from a2tg_jax.training.history import History
 from a2tg_jax.training.loop import IsStopped, OnCheckpoint, OnLog, Session, StageRun, never
 from a2tg_jax.training.options import System
 from a2tg_jax.training.reports import Display, Progress, RestOfRun
-from a2tg_jax.training.stage import BACKGROUNDS
-from a2tg_jax.training.start import checked_start
+from a2tg_jax.training.stage import Stage
+from a2tg_jax.training.start import check_points, given_model, initial_model
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -170,33 +172,50 @@ def fit(
       array([10, 20])
     """
     _check_arguments(scene, system, start, resume, checkpoint_every, progress)
-    stages = system.all_stages()
-    first = 0
-    if resume is not None:
-        if start is not None:
-            raise ValueError("start and resume are both given, but a checkpoint has its own model: leave out start")
-        first = resume.stage
-        # A finished stage is not resumed if the next one continues it.
-        if first + 1 < len(stages) and stages[first + 1].continues and resume.is_at_end:
-            first += 1
     session = session or Session()
-    start = checked_start(scene, system, first, start, resume, len(stages))
+    first = 0
     model_bytes: list[float] = []
+    begin: Model | Checkpoint
     if resume is None:
-        num = None if start is None else start.num
-        model_bytes = check_rows_fit(scene, system, first, num, session.devices, max_memory)
+        begin, model_bytes = _checked_start(scene, system, 0, start, session, max_memory)
+    elif start is not None:
+        raise ValueError("start and resume are both given, but a checkpoint has its own model: leave out start")
+    else:
+        check_resume(resume, system)
+        begin = resume
+        first = resume.stage
+    stages = system.all_stages()
+    # A finished stage is not resumed if the next one continues it.
+    if resume is not None and resume.is_at_end and first + 1 < len(stages) and stages[first + 1].continues:
+        first += 1
+    for stage in stages[first:]:
+        stage.check_views(scene.train)
     results: list[StageResult] = []
     for index in range(first, len(stages)):
-        run = StageRun(scene, system, index, start, resume, session=session, max_memory=max_memory)
         after = RestOfRun(model_bytes=max(model_bytes[index + 1 :], default=0))
-        run.train(on_checkpoint, checkpoint_every, on_log, Progress(progress, after=after), is_stopped)
+        run = StageRun(scene, system, index, begin, None, session, max_memory, Progress(progress, after=after))
+        run.train(on_checkpoint, checkpoint_every, on_log, is_stopped)
         is_last = index == len(stages) - 1
         results.append(_result_of(run, scene, is_last=is_last))
-        start = results[-1].model
-        resume = run.checkpoint if is_last or stages[index + 1].continues else None
-    assert resume is not None
+        begin = run.checkpoint if is_last or stages[index + 1].continues else results[-1].model
+    assert isinstance(begin, Checkpoint)
     # In the memory of the host, so that further trainings have the memory of the GPU.
-    return FitResult(system, tuple(results), dataclasses.replace(resume, state=jax.tree.map(np.asarray, resume.state)))
+    return FitResult(system, tuple(results), dataclasses.replace(begin, state=jax.tree.map(np.asarray, begin.state)))
+
+
+def _checked_start(
+    scene: Scene, system: System, index: int, start: Model | None, session: Session, max_memory: int | None
+) -> tuple[Model, list[float]]:
+    """Return the model from which training begins with a stage, and the largest bytes of the model of this stage and
+    those after it, after all checks before rows are allocated."""
+    num = None
+    if start is None:
+        check_points(scene, system)
+    else:
+        start = given_model(start, scene, system, index)
+        num = start.num
+    model_bytes = check_rows_fit(scene, system, index, num, session.devices, max_memory)
+    return initial_model(scene, system) if start is None else start, model_bytes
 
 
 def _check_arguments(
@@ -286,20 +305,39 @@ def fit_stage(
     stages = system.all_stages()
     if not 0 <= index < len(stages):
         raise ValueError(f"index must be in 0..{len(stages) - 1}, one of the stages; got {index}")
+    stages[index].check_views(scene.train)
     session = session or Session()
-    start = checked_start(scene, system, index, start, resume)
+    begin: Model | Checkpoint
     if resume is None:
-        check_rows_fit(scene, system, index, None if start is None else start.num, session.devices, max_memory)
-    run = StageRun(scene, system, index, start, resume, num_restored, session, max_memory)
-    bar = progress if isinstance(progress, Progress) else Progress(progress)
-    run.train(on_checkpoint, checkpoint_every, on_log, bar, is_stopped)
+        begin, _ = _checked_start(scene, system, index, start, session, max_memory)
+    else:
+        _check_stage(resume, stages, index)
+        check_resume(resume, system)
+        begin = resume
+    if not isinstance(progress, Progress):
+        progress = Progress(progress)
+    run = StageRun(scene, system, index, begin, num_restored, session, max_memory, progress)
+    run.train(on_checkpoint, checkpoint_every, on_log, is_stopped)
     return _result_of(run, scene, is_last=index == len(stages) - 1)
+
+
+def _check_stage(resume: Checkpoint, stages: Sequence[Stage], index: int) -> None:
+    """Raise ValueError unless the checkpoint is of that stage, or of the end of the stage that it continues."""
+    if resume.stage == index:
+        return
+    if resume.stage != index - 1 or not stages[index].continues:
+        raise ValueError(f"the checkpoint is of stage {resume.stage + 1}, but stage {index + 1} was to be resumed")
+    if not resume.is_at_end:
+        raise ValueError(
+            f"the checkpoint is of iteration {resume.iteration:,} of {stages[resume.stage].iterations:,} of stage "
+            f"{resume.stage + 1}, which stage {index + 1} continues: resume that one first"
+        )
 
 
 def _result_of(run: StageRun, scene: Scene, *, is_last: bool) -> StageResult:
     """Return the result of a trained stage."""
     origin = corrected_origin(scene.origin, run.stage.corrections, run.whole_state.corrections)
-    model = dataclasses.replace(run.model, background=BACKGROUNDS[run.system.background], origin=origin)
+    model = dataclasses.replace(run.model, background=run.system.background_color, origin=origin)
     if is_last:
         warn_of_budget(run.system, model)
     return StageResult(run.stage.name, model, run.history, run.seconds, run.num_regrown)

@@ -217,7 +217,7 @@ def differentiate(
         return value, (auxiliary, num_pairs)
 
     # Adds nothing to the render; the gradient at it is the statistic.
-    probe = jnp.zeros((model.gaussians.num, 4), jnp.result_type(model.gaussians.means)) if has_probe else None
+    probe = jnp.zeros((model.num_rows, 4), jnp.result_type(model.gaussians.means)) if has_probe else None
     with_gradients = jax.value_and_grad(of_floats, argnums=(0, 1, 2, 3), has_aux=True)
     (value, (auxiliary, num_pairs)), gradients = with_gradients(model.gaussians, floats, view.rows, probe, view)
     return Differentiated(value, auxiliary, num_pairs, *gradients)

@@ -8,35 +8,33 @@ import contextlib
 import dataclasses
 import datetime
 import time
-import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from a2tg_jax.base.even_spacing import evenly_chosen
 from a2tg_jax.base.machine import Devices
 from a2tg_jax.base.text import in_bytes
 from a2tg_jax.core.compilations import compilations
-from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.table import Layout
-from a2tg_jax.events import Due, Event, HostEvent, StepEvent
+from a2tg_jax.events import Due, HostEvent, StepEvent
 from a2tg_jax.model import Model
-from a2tg_jax.parallel import any_process, check_batch_size, divided, everywhere, mesh_of, num_processes, whole
+from a2tg_jax.parallel import any_process, divided, everywhere, mesh_of, num_processes, whole
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.room import TileRoom, most_pairs
 from a2tg_jax.scene import Scene
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
-from a2tg_jax.training.checkpoint import COLUMNS, TERM, Checkpoint, History, Interrupted
+from a2tg_jax.training.checkpoint import Checkpoint, Interrupted, state_of_checkpoint
 from a2tg_jax.training.cost import check_step_fits
 from a2tg_jax.training.divergence import DivergedError, largest_loss, what_diverged
+from a2tg_jax.training.history import COLUMNS, History
 from a2tg_jax.training.options import System
 from a2tg_jax.training.recorded_views import RecordedViews
-from a2tg_jax.training.reports import Display, LearningCheck, Pace, Progress, RestOfRun, StageEffects
+from a2tg_jax.training.reports import Display, LearningCheck, Pace, Progress, StageEffects
 from a2tg_jax.training.returned import calling, checked_change
-from a2tg_jax.training.stage import BACKGROUNDS
-from a2tg_jax.training.start import state_of_checkpoint, state_of_start
+from a2tg_jax.training.start import state_of_model
 from a2tg_jax.training.step import (
     EXPLODED,
     FINE,
@@ -44,6 +42,7 @@ from a2tg_jax.training.step import (
     NOT_FINITE,
     OVERFLOW,
     StepInfo,
+    StepInputs,
     StepSettings,
     TrainState,
     attempt,
@@ -128,6 +127,16 @@ class Session:
         self.room = TileRoom()
         """Capacities of tile lists, by appearance, rows and image size."""
 
+    def check_batch_size(self, batch_size: int) -> None:
+        """Raise ValueError unless each device draws the same number of views."""
+        if batch_size % self.num_devices:
+            fitting = [str(number) for number in range(1, self.num_devices) if batch_size % number == 0]
+            raise ValueError(
+                f"batch_size must be a multiple of the {self.num_devices} devices, because a device draws whole views; "
+                f"got {batch_size}: take {self.num_devices} or a multiple of it, or {' or '.join(fitting)} of the "
+                "devices (others would have nothing to draw)"
+            )
+
 
 class StageRun:
     """One stage during training: its state, and the bookkeeping in Python."""
@@ -137,66 +146,84 @@ class StageRun:
         scene: Scene,
         system: System,
         index: int,
-        start: Model | None = None,
-        resume: Checkpoint | None = None,
+        start: Model | Checkpoint,
         num_restored: int | None = None,
         session: Session | None = None,
         max_memory: int | None = None,
+        progress: Progress = Progress(),  # noqa: B008 - immutable
     ):
         """Args:
-        scene: training views and points.
+        scene: training views.
         system: the options.
         index: number of the stage in `system.all_stages()`, from 0.
-        start: the model to start from; None: `resume`, or Gaussians at the scene's points.
-        resume: a checkpoint of this stage, or of the end of the stage that it continues (`checkpoint.check_resume`).
+        start: the model to start from, or a checkpoint of this stage, or of the end of the stage that it continues.
         num_restored: which order of the views, from 0; None: the checkpoint's order, or the first.
         session: what trainings of this process share; None: a new one.
         max_memory: bytes that may be in use; None: what the machine or the GPU has available.
+        progress: how progress is shown, and what follows the stage.
         """
         self.session = session or Session()
+        self.session.check_batch_size(system.batch_size)
         self.mesh = self.session.mesh
-        check_batch_size(system.batch_size, self.session.num_devices)
         self.views = scene.train
         self.system = system
         self.index = index
+        stages = system.all_stages()
+        self.stage = stages[index]
         self._recorded_views = RecordedViews.of(scene.train)
-        self.stage = system.all_stages()[index]
-        resumed = resume if resume is not None and resume.stage == index else None
-        if num_restored is None:
-            num_restored = resumed.num_restored if resumed else 0
-        self.num_restored = num_restored
-        self._earlier = resumed.history if resumed else History.empty()
+        self._earlier = History.empty()
         self._rows: list[dict[str, float]] = []
         """Rows that were logged after `_earlier`."""
-
-        if resume is None:
-            state = state_of_start(scene, system, index, start, self.session.num_devices)
+        self.num_refused = 0
+        num_devices = self.session.num_devices
+        if isinstance(start, Checkpoint):
+            state = state_of_checkpoint(start, stages, index, scene.train, num_devices)
+            if start.stage == index:
+                self._earlier = start.history
+                self.num_refused = start.num_refused
+                num_restored = start.num_restored if num_restored is None else num_restored
         else:
-            state = state_of_checkpoint(scene, system, index, resume, self.session.num_devices)
+            state = state_of_model(start, self.stage, system, [view.name for view in scene.train], num_devices)
         self.state = divided(self.mesh, state)
+        self.num_restored = num_restored or 0
 
+        end = self.stage.iterations
         self.largest_loss = largest_loss(self.history)
         self.scene_scale = jnp.asarray(scene.scale, self.state.model.gaussians.means.dtype)
         self.key = jax.random.fold_in(jax.random.key(system.seed), index + 1)
         self.order = BatchOrder(self.views, system.batch_size, system.seed * 2 + index + 1, self.num_restored)
-        self.photographs = PhotoStore(self.views, self.order, self.stage.iterations, self.mesh, self.stage.has_depths)
+        self.photographs = PhotoStore(self.views, self.order, end, self.mesh, self.stage.has_depths)
         self.num_launched = LAUNCHED if self.photographs.is_resident else self.photographs.num_ahead
         self.learning = LearningCheck(
-            self.views, self.order, self.stage.iterations, system.background, is_first=index == 0,
-            small_budget=system.small_budget,
-        )  # fmt: skip
+            self.views, self.order, end, system.background, is_first=index == 0, small_budget=system.small_budget
+        )
         self.effects = StageEffects(self.stage, system, len({view.picture.size for view in self.views}))
+        most = max((event.most_gaussians or 0 for event in self.stage.events), default=0)
+        self._pace = Pace(int(self.state.iteration), end, most_gaussians=most, after=progress.after)
+        self._progress = progress
         self.capacities: dict[Size, int] = {}
         """Capacities of the tile lists that steps are compiled for."""
         self.memory: float | None = None
         """Bytes in use while a step runs; None: no step is compiled yet."""
         self._max_memory = max_memory
-        self._after = RestOfRun()
         self.started = time.perf_counter()
         self.time_left: datetime.timedelta | None = None
         """Remaining time of the run, about; None at the beginning."""
         self.num_regrown = 0
-        self.num_refused = resumed.num_refused if resumed else 0
+
+        self._host_iterations: list[int] = []
+        """Iterations after which host events happen, or statistics are dropped."""
+        self._last_gathered: list[int] = []
+        """Iteration after which the statistic of each event is dropped; 0: it is kept, because too few iterations are
+        left to compile a step without it."""
+        for event, times in zip(self.stage.events, self.stage.times, strict=True):
+            if isinstance(event, HostEvent):
+                self._host_iterations += times
+            last = 0
+            if times and event.observes and end - times[-1] >= WORTH_COMPILING:
+                last = times[-1]
+                self._host_iterations.append(last)
+            self._last_gathered.append(last)
 
     @property
     def history(self) -> History:
@@ -230,26 +257,21 @@ class StageRun:
         on_checkpoint: OnCheckpoint | None = None,
         checkpoint_every: int | None = None,
         on_log: OnLog | None = None,
-        progress: Progress = Progress(),  # noqa: B008 - immutable
         is_stopped: IsStopped = never,
     ) -> None:
         """Run the stage to its end, then release its photographs. If it is stopped, write a last checkpoint and raise
         `Interrupted`.
         """
-        self._after = progress.after
         iteration = int(self.state.iteration)
         end = self.stage.iterations
-        self.effects.warn_of_never()
         # Several processes launch the same steps, and stop together.
         stops_launching = is_stopped if num_processes(self.mesh) == 1 else never
-        most = max((event.most_gaussians or 0 for event in self.stage.events), default=0)
-        pace = Pace(iteration, end, most_gaussians=most, after=progress.after)
-        display = (progress.display or Display)(progress.title or self.stage.name, iteration, end)
+        display = (self._progress.display or Display)(self._progress.title or self.stage.name, iteration, end)
         with contextlib.closing(self.photographs), display:
             while iteration < end:
                 # Python acts after `num_launched` steps, and at events and checkpoints.
                 pauses = [iteration + self.num_launched - iteration % self.num_launched, end]
-                pauses += [due for due in self._due_on_host() if due > iteration]
+                pauses += [pause for pause in self._host_iterations if pause > iteration]
                 if checkpoint_every is not None:
                     pauses.append(iteration + checkpoint_every - iteration % checkpoint_every)
                 pause = min(pauses)
@@ -259,45 +281,31 @@ class StageRun:
                         self._log(iteration, info, on_log)
                     self.learning.observe(iteration, float(info.psnr))
                     row = self._rows[-1] if self._rows else None
-                    display.update(float(info.loss), float(info.psnr), row, pace.left(iteration))
+                    display.update(float(info.loss), float(info.psnr), row, self._pace.left(iteration))
                 ahead = self.effects.programs_ahead(iteration)
-                pace.time(iteration, self.effects.num_compiled, ahead, self.effects.seconds_a_program)
-                forecast = pace.due_forecast(iteration)
+                self._pace.time(iteration, self.effects.num_compiled, ahead, self.effects.seconds_a_program)
+                forecast = self._pace.forecast_at(iteration)
                 if forecast is not None:
                     display.tell(f"{forecast}; {in_bytes(self.memory or 0)} of memory")
-                self.time_left = pace.left(iteration)
+                self.time_left = self._pace.left(iteration)
                 # `iteration` is less if a step could not be taken or training is being stopped.
-                if iteration == pause:
+                if iteration == pause and iteration in self._host_iterations:
                     self._host_events(iteration)
                 self.started += self.session.watch(self, is_stopped)
                 must_stop = any_process(self.mesh, is_stopped())
-                is_due = checkpoint_every is not None and iteration % checkpoint_every == 0 and iteration == pause
-                if on_checkpoint is not None and (is_due or must_stop or iteration == end):
+                must_save = checkpoint_every is not None and iteration % checkpoint_every == 0 and iteration == pause
+                if on_checkpoint is not None and (must_save or must_stop or iteration == end):
                     on_checkpoint(self.checkpoint)
                 if must_stop:
                     raise Interrupted(self.checkpoint)
-        self.effects.warn_of_unused()
-        self._warn_of_refused()
-
-    def _warn_of_refused(self) -> None:
-        """Warn if Gaussians that events should have added found no room."""
-        if self.num_refused == 0:
-            return
-        events = [event for event in self.stage.events if event.limited_by]
-        caps = [f"{self.system.path_of(event)}.{event.limited_by}" for event in events]
-        advice = f": raise {' or '.join(caps)}" if caps else ""
-        warnings.warn(
-            f"stage {self.stage.name}: {self.num_refused:,} times there was no room for a Gaussian that should "
-            f"have been added, all {self.state.model.gaussians.num:,} rows being in use{advice}",
-            stacklevel=3,
-        )
+        self.effects.warn_at_end(self.num_refused, self.state.model.num_rows)
 
     def _log(self, iteration: int, info: StepInfo, on_log: OnLog | None) -> None:
         """Add a row to the history."""
         num_live = int(info.num_live)
         megabytes = self.state.model.bytes_of(num_live) / 1e6
         values = self.index + 1, iteration, float(info.loss), float(info.psnr), num_live, megabytes, self.seconds
-        terms = {f"{TERM}{name}": float(value) for name, value in info.terms.items()}
+        terms = {f"{History.prefix}{name}": float(value) for name, value in info.terms.items()}
         self._rows.append(dict(zip(COLUMNS, values, strict=True)) | terms)
         if on_log is not None:
             on_log(self._rows[-1])
@@ -317,7 +325,7 @@ class StageRun:
         taken = [info for info in infos if info.status == FINE]
         self.num_refused += sum(int(info.num_refused) for info in taken)
         if len(taken) < len(infos):
-            self._mend(first + len(taken), infos[len(taken)])
+            self._after_failure(first + len(taken), infos[len(taken)])
         return taken
 
     def _launch(self, iteration: int) -> StepInfo:
@@ -327,7 +335,12 @@ class StageRun:
         with compilations() as phases:
             try:
                 if self.memory is None:
-                    self.memory = self._memory_of(arguments)
+                    # The call that follows finds this program, in JAX's cache of this process.
+                    step = jitted_step().lower(*arguments).compile()
+                    model_bytes = sum(leaf.nbytes for leaf in jax.tree.leaves(self.state.model))
+                    self.memory = check_step_fits(
+                        step, model_bytes, self._progress.after, self.system, self.session.devices, self._max_memory
+                    )
                 self.state, info = jitted_step()(*arguments)
             except ValueError as error:  # The step is not compiled for the name of its stage.
                 raise ValueError(f"stage {self.stage.name!r}: {error}") from error
@@ -337,26 +350,19 @@ class StageRun:
             self.session.after_compiling()
         return info
 
-    def _memory_of(self, arguments: tuple[Any, ...]) -> float:
-        """Compile the first step, and return the bytes in use while it runs. Raises ValueError if it cannot fit, or
-        if a later stage of the run probably cannot."""
-        # The call that follows finds this program, in JAX's cache of this process.
-        step = jitted_step().lower(*arguments).compile()
-        model_bytes = sum(leaf.nbytes for leaf in jax.tree.leaves(self.state.model))
-        return check_step_fits(step, model_bytes, self._after, self.system, self.session.devices, self._max_memory)
-
-    def arguments(self, iteration: int) -> tuple[Any, ...]:
+    def arguments(self, iteration: int) -> tuple[StepSettings, TrainState, StepInputs]:
         """Return the arguments of the step of an iteration."""
-        photographs, views = self.photographs.batch(iteration)
+        photographs, chosen = self.photographs.batch(iteration)
         render = self.render_settings(self._size(iteration))
         clock = self.stage.clock(iteration, self.largest_loss)
-        due = None
+        happens = None
         if are_events_decided_by_host(self.state):
-            due = tuple(left is None or left > 0 for left in clock.num_left)
-        settings = StepSettings(render, self.system.background, due, self.mesh)
-        rows = np.asarray(self.order.indices(iteration), np.int32) if self.stage.corrections else None
-        rows = everywhere(self.mesh, rows)
-        return settings, self.stage, clock, self.state, photographs, views, self.scene_scale, self.key, rows
+            happens = tuple(left is None or left > 0 for left in clock.num_left)
+        settings = StepSettings(render, self.system.background, happens, self.mesh)
+        views = np.asarray(self.order.indices(iteration), np.int32) if self.stage.corrections else None
+        views = everywhere(self.mesh, views)
+        inputs = StepInputs(self.stage, clock, photographs, chosen, views, self.scene_scale, self.key)
+        return settings, self.state, inputs
 
     def _size(self, iteration: int) -> Size:
         return self.views[self.order.indices(iteration)[0]].picture.size
@@ -373,16 +379,16 @@ class StageRun:
             sample = evenly_chosen(views, PLANNED_VIEWS)
             cameras = [jax.tree.map(lambda x: jnp.asarray(x, dtype), view.camera) for view in sample]
             pairs = most_pairs(model.gaussians, cameras, appearance, settings, model.num_live)
-            growth = (model.gaussians.num / max(model.num, 1)) ** 0.5
+            growth = (model.num_rows / max(model.num, 1)) ** 0.5
             self.capacities[size] = self.session.room.plan(self._place(size), pairs * GROWTH_ROOM * growth)
         return dataclasses.replace(settings, capacity=self.capacities[size])
 
     def _place(self, size: Size) -> tuple[object, ...]:
-        """Return the key of a capacity of the session: stages that show the same share it."""
-        return self.stage.appearance, self.state.model.gaussians.num, *size
+        """Return the place of a capacity in the session's room: stages that show the same share it."""
+        return self.stage.appearance, self.state.model.num_rows, *size
 
-    def _mend(self, iteration: int, info: StepInfo) -> None:
-        """Make more room for the tile lists; raise an error for every other cause."""
+    def _after_failure(self, iteration: int, info: StepInfo) -> None:
+        """Make more room if the tile lists of a step overflowed; raise an error for every other cause."""
         # With its present status all further steps would stay idle.
         self.state = dataclasses.replace(self.state, status=jnp.zeros_like(self.state.status))
         if info.status == OVERFLOW:
@@ -411,40 +417,23 @@ class StageRun:
 
     # Events between steps
 
-    def _due_on_host(self) -> list[int]:
-        """Return the iterations of all host events, and the last one of each step event whose statistic is dropped."""
-        due: list[int] = []
-        for event, times in zip(self.stage.events, self.stage.times, strict=True):
-            if isinstance(event, HostEvent):
-                due += times
-            elif times and self._is_dropped_after(event, times[-1]):
-                due.append(times[-1])
-        return due
-
-    def _is_dropped_after(self, event: Event, last: int) -> bool:
-        """Return whether what an event gathers is dropped after its last time: if enough iterations are left to compile
-        a step without the statistics that nothing reads."""
-        return event.observes and self.stage.iterations - last >= WORTH_COMPILING
-
     def _host_events(self, iteration: int) -> None:
         """Apply the host events that follow an iteration, and drop the statistics of past events."""
-        if iteration not in self._due_on_host():
-            return
         if self.mesh is not None:
             self.state = jax.device_put(self.whole_state)
         for place, (event, times) in enumerate(zip(self.stage.events, self.stage.times, strict=True)):
-            if iteration not in times:
-                continue
-            if isinstance(event, HostEvent):
+            if isinstance(event, HostEvent) and iteration in times:
                 self._apply(place, event, times.index(iteration) + 1, len(times))
-            if iteration == times[-1] and self._is_dropped_after(event, iteration):
+            if iteration == self._last_gathered[place]:
                 self._keep(place, None)
         self.state = divided(self.mesh, self.state)
 
     def _apply(self, place: int, event: HostEvent, index: int, count: int) -> None:
         """Apply the event at a place, for the `index`-th of `count` times."""
-        background = BACKGROUNDS[self.system.background]
-        due = Due(index, count, self.views, background, self.system.seed, self.session.layouts)
+        due = Due(
+            index, count, self.views, self.system.background_color, self.system.seed, self.session.layouts,
+            self.session.room,
+        )  # fmt: skip
         with calling(event, "apply", self.stage.name):
             change = event.apply(due, self.state.model, self.state.moments, self.state.events[place])
             change = checked_change(change)

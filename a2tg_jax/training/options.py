@@ -10,10 +10,11 @@ from a2tg_jax.base.config_json import changed_config, check_config, config_to_di
 from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.text import budget_in_bytes, did_you_mean, in_bytes, megabytes_of, shortened
 from a2tg_jax.core.budget import BYTES_PER_FLOAT, bytes_per_gaussian
+from a2tg_jax.core.origin import BLACK, WHITE, Color
 from a2tg_jax.events import Event
 from a2tg_jax.rasterize.kernels.platforms import MAX_TILE_SIZE
 from a2tg_jax.training.corrections import BilateralGrid, Correction, Exposure, PoseRefinement
-from a2tg_jax.training.stage import LearningRates, LossTerm, Stage
+from a2tg_jax.training.stage import Background, LearningRates, LossTerm, Stage
 from a2tg_jax.training.terms import (
     DepthKind,
     DepthPrior,
@@ -129,7 +130,7 @@ class System(NamedFields):
     """Budget of the model's bytes in memory, not in files: 1.5MB, 800kB, 2GB, or a number of MB (10^6 bytes). The
     model stays within it at every iteration and ends within 0.5 % of it. It sets the number of Gaussians and texels,
     instead of densify.cap."""
-    background: Literal["black", "white", "random"] = "black"
+    background: Background = "black"
     """Background of renders, and of transparent photographs."""
     sh_degree: int = 3
     """Highest degree of spherical harmonics, 0 to 3."""
@@ -164,6 +165,12 @@ class System(NamedFields):
             object.__setattr__(self, "more", tuple(self.more))
 
     @property
+    def background_color(self) -> Color:
+        """Background of its models, and of what events on the host render, RGB in [0, 1]; black where training takes
+        random ones."""
+        return WHITE if self.background == "white" else BLACK
+
+    @property
     def initial_sh_degree(self) -> int:
         """Degree of spherical harmonics of the Gaussians that training starts from."""
         return self.sh_degree
@@ -171,7 +178,7 @@ class System(NamedFields):
     @property
     def initial_bytes(self) -> float:
         """Bytes of a Gaussian that training starts from, with its appearance in the first stage."""
-        return bytes_per_gaussian(self.initial_sh_degree, self.stages()[0].floats_shown(self.initial_sh_degree))
+        return bytes_per_gaussian(self.initial_sh_degree, self.stages()[0].floats_shown)
 
     @property
     def budget_bytes(self) -> int | None:
@@ -377,7 +384,7 @@ class System(NamedFields):
             return ("memory_budget",)
         return self.caps() or ("initial_gaussians",)
 
-    def check_number(self, num: int) -> None:
+    def check_initial_number(self, num: int) -> None:
         """Check the options for a number of Gaussians at the start.
 
         Raises:
@@ -391,12 +398,11 @@ class System(NamedFields):
         Raises:
           ValueError: naming the option.
         """
-        self.check_number(num)
+        self.check_initial_number(num)
         if self.budget_bytes is None:
             return
-        degree = self.initial_sh_degree
         for stage in self.stages():
-            size = bytes_per_gaussian(degree, stage.floats_shown(degree))
+            size = bytes_per_gaussian(self.initial_sh_degree, stage.floats_shown)
             left = self.budget_bytes - stage.shared_bytes
             if num * size > left:
                 raise ValueError(

@@ -97,7 +97,7 @@ class Pace:
         self._now = now
         self._most = most_gaussians
         self._after = after
-        self._due = [first, (first + total) // 2]
+        self._told_at = [first, (first + total) // 2]
         self._before: tuple[int, float, int] | None = None
         self._steps = 0
         self._seconds = 0.0
@@ -119,16 +119,17 @@ class Pace:
                 self._seconds += now - before
         self._before = done, now, num_compiled
 
-    def due_forecast(self, done: int) -> str | None:
-        """Return a forecast if one is due and enough was timed since the last, or None."""
+    def forecast_at(self, done: int) -> str | None:
+        """Return a forecast if it is time for one and enough was timed since the last, or None."""
         left = self.left(done)
-        is_due = self._due and done >= self._due[0] and self._steps >= TIMED_STEPS and self._seconds >= TIMED_SECONDS
-        if left is None or not is_due or done >= self._total:
+        is_time = bool(self._told_at) and self._told_at[0] <= done < self._total
+        if left is None or not is_time or self._steps < TIMED_STEPS or self._seconds < TIMED_SECONDS:
             return None
-        growing = f"; more as Gaussians are added, up to {self._most:,}" if self._most and len(self._due) > 1 else ""
+        is_growing = self._most and len(self._told_at) > 1
+        growing = f"; more as Gaussians are added, up to {self._most:,}" if is_growing else ""
         compiling = f", with {counted(self._ahead, 'program')} to compile" if self._ahead else ""
         pace = f"{1e3 * self._seconds / self._steps:,.0f} ms an iteration"
-        self._due = [due for due in self._due[1:] if due > done]
+        self._told_at = [later for later in self._told_at[1:] if later > done]
         self._steps = 0
         self._seconds = 0.0
         return f"{pace}, about {left} left{compiling}{growing}"
@@ -245,6 +246,7 @@ class StageEffects:
         self.num_compiled = 0
         """Number of compiled steps so far."""
         self._seconds = 0.0
+        self._warn_of_never()
 
     def apply(self, place: int, state: TrainState, change: Change) -> None:
         """Record a change of the state by the event at an index."""
@@ -308,7 +310,7 @@ class StageEffects:
         """Return the times from an iteration on after which there are steps."""
         return [time for time in times if iteration <= time < self._stage.iterations]
 
-    def warn_of_never(self) -> None:
+    def _warn_of_never(self) -> None:
         """Warn of events that never happen within the stage."""
         end = self._stage.iterations
         for event, times in zip(self._stage.events, self._stage.times, strict=True):
@@ -322,8 +324,9 @@ class StageEffects:
                     stacklevel=2,
                 )
 
-    def warn_of_unused(self) -> None:
-        """Warn of events that happened at all their times and never made a difference."""
+    def warn_at_end(self, num_refused: int, num_rows: int) -> None:
+        """Warn of events that happened at all their times and never made a difference, and of Gaussians that events
+        should have added and that found no room among all rows."""
         unused = []
         for event, times, effects in self._on_host.values():
             # In a resumed stage, the first times may have been before.
@@ -336,3 +339,12 @@ class StageEffects:
                 unused.append(f"{name}.{effects.unused}")
         if unused:
             warnings.warn(f"stage {self._stage.name!r}: {'; '.join(unused)}", stacklevel=2)
+        if num_refused:
+            events = [event for event in self._stage.events if event.limited_by]
+            caps = [f"{self._system.path_of(event)}.{event.limited_by}" for event in events]
+            advice = f": raise {' or '.join(caps)}" if caps else ""
+            warnings.warn(
+                f"stage {self._stage.name}: {num_refused:,} times there was no room for a Gaussian that should have "
+                f"been added, all {num_rows:,} rows being in use{advice}",
+                stacklevel=2,
+            )

@@ -6,6 +6,7 @@ import inspect
 import math
 import numbers
 import re
+from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
 import jax
@@ -20,14 +21,15 @@ from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.text import shortened
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.gaussians import Gaussians, no_rows
-from a2tg_jax.core.origin import BLACK, WHITE, Color
 from a2tg_jax.core.pytree import beside, check_pytree, pytree, static
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.events import Event, HostEvent, StepEvent, Times, every_iteration
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.render_types import RenderOutput
+from a2tg_jax.scene import View
 from a2tg_jax.training.corrections import Correction
+from a2tg_jax.training.losses import SSIM_WINDOW
 from a2tg_jax.training.returned import calling
 from a2tg_jax.training.terms import Target
 
@@ -74,8 +76,7 @@ T = TypeVar("T")
 COOLED = 0.1
 """Factor of learning rates at the end of a stage that cools down."""
 Background = Literal["black", "white", "random"]
-BACKGROUNDS: dict[Background, Color] = {"black": BLACK, "white": WHITE, "random": BLACK}
-"""Background of models, and of what events on the host render, for each background of training."""
+"""Background of the views while a stage is trained."""
 
 
 class LossTerm(Protocol):
@@ -141,17 +142,35 @@ class Stage(NamedFields):
         """Whether a loss term reads the depth maps of the photographs (`Target.depth`)."""
         return any(getattr(term, "has_depths", False) for term in self.losses)
 
-    def floats_shown(self, sh_degree: int) -> float:
-        """Return the floats of appearance that a Gaussian of a degree has when the stage begins (host)."""
-        few = no_rows(64, NUM_BASES[sh_degree])
-        appearance = allocate_appearance(self.appearance, jax.random.key(0), few)
-        return (count_floats(appearance, few.num) - count_floats(appearance, 0)) / few.num
+    def check_views(self, views: Sequence[View]) -> None:
+        """Raise ValueError if the losses read depth maps and no view has one, or if a view is too small for SSIM."""
+        for view in views if self.has_ssim else ():
+            if min(view.picture.size) < SSIM_WINDOW:
+                height, width = view.picture.size
+                raise ValueError(
+                    f"view {view.name} has {width} by {height} pixels, but the loss has SSIM, which needs "
+                    f"{SSIM_WINDOW} by {SSIM_WINDOW}: take larger photographs, or set loss.ssim_weight to 0"
+                )
+        if self.has_depths and all(view.depth is None for view in views):
+            raise ValueError(
+                "loss.depth_weight, or a custom term, needs depth maps, but no training view has one: put them as "
+                "NAME.npy or NAME.png into the folder depths next to images, or leave it out"
+            )
+
+    @functools.cached_property
+    def _appearance_of_two(self) -> Appearance:
+        """Appearance of two Gaussians when the stage begins (host)."""
+        return allocate_appearance(self.appearance, jax.random.key(0), no_rows(2, 1))
+
+    @property
+    def floats_shown(self) -> float:
+        """Floats of appearance that a Gaussian has when the stage begins (host)."""
+        return (count_floats(self._appearance_of_two, 2) - count_floats(self._appearance_of_two, 0)) / 2
 
     @property
     def shared_bytes(self) -> int:
         """Bytes of what the Gaussians share (host)."""
-        appearance = allocate_appearance(self.appearance, jax.random.key(0), no_rows(2, 1))
-        return BYTES_PER_FLOAT * count_floats(appearance, 0)
+        return BYTES_PER_FLOAT * count_floats(self._appearance_of_two, 0)
 
     @functools.cached_property
     def times(self) -> tuple[Times, ...]:
@@ -232,10 +251,8 @@ class Stage(NamedFields):
                         )
         check_pytree(f"{where} appearance", self.appearance)
         # Two rows are enough to learn whether there are arrays, and whether they have rows.
-        two = no_rows(2, 1)
-        few = allocate_appearance(self.appearance, jax.random.key(0), two)
-        check_appearance(few, two)
-        if self.appearance_rate is None and jax.tree.leaves(few):
+        check_appearance(self._appearance_of_two, no_rows(2, 1))
+        if self.appearance_rate is None and jax.tree.leaves(self._appearance_of_two):
             raise ValueError(
                 f"{where} appearance_rate must be the learning rate of the arrays of {self.appearance.description}, "
                 "such as 1e-2, or 0 if they are to stay unchanged; got none"

@@ -1,4 +1,4 @@
-"""Start of training: Gaussians at a scene's points, and spare rows for those that events add."""
+"""Start of a stage: Gaussians at a scene's points, or a given model; and its state, with room for what events add."""
 
 import dataclasses
 import warnings
@@ -17,20 +17,21 @@ from a2tg_jax.base.checks import fields_of
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import INITIAL_OPACITY, Gaussians, init_from_points, no_rows
 from a2tg_jax.core.geometry import FILTER_VARIANCE, pixel_sizes
+from a2tg_jax.core.optim import adam_init
+from a2tg_jax.core.origin import Origin
+from a2tg_jax.core.pytree import partition
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.sight import Sight, unseeing
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.core.table import Table, is_table, map_rows
 from a2tg_jax.events import LEAST_LEFT, Change, Event, HostEvent
 from a2tg_jax.model import Model, check_model, plain_gaussians
-from a2tg_jax.scene import Scene, View
-from a2tg_jax.training.checkpoint import Checkpoint, check_resume
-from a2tg_jax.training.corrections import check_corrections
-from a2tg_jax.training.losses import SSIM_WINDOW
+from a2tg_jax.scene import Scene
+from a2tg_jax.training.corrections import initial_corrections
 from a2tg_jax.training.options import System
 from a2tg_jax.training.returned import calling, checked_change
 from a2tg_jax.training.stage import Stage
-from a2tg_jax.training.step import TrainState, continued_state, initial_state
+from a2tg_jax.training.step import TrainState
 
 T = TypeVar("T")
 
@@ -44,75 +45,39 @@ GREY_SLACK = 0.01
 """Largest difference of a colour that counts as this grey."""
 
 
-def checked_start(
-    scene: Scene, system: System, index: int, start: Model | None, resume: Checkpoint | None, num_stages: int = 1
-) -> Model | None:
-    """Return the model from which training begins with a stage: None for Gaussians at the scene's points, or if a
-    checkpoint is resumed. Raises ValueError unless this stage and those after it, `num_stages` in all, can be trained.
-    """
-    check_loss_data(scene.train, system.all_stages()[index : index + num_stages])
-    if resume is not None:
-        check_resume(resume, system, index)
-        return None
-    if start is None:
-        check_start(scene, system)
-        return None
-    return given_start(start, scene, system, index)
+# Gaussians at the points of the scene
 
 
-def state_of_start(scene: Scene, system: System, index: int, start: Model | None, num_devices: int) -> TrainState:
-    """Return the state before the first iteration of a stage, from a model or from Gaussians at the scene's points."""
-    stage = system.all_stages()[index]
-    start = initial_model(scene, system) if start is None else start
-    model = padded(copied(start.live), stage, system, num_devices)
-    return with_room(stage, initial_state(stage, model, [view.name for view in scene.train], start.origin))
+def check_points(scene: Scene, system: System) -> None:
+    """Raise ValueError, naming the options to change, if no training view sees any point, or the events of the first
+    stage cannot work with the initial number of Gaussians."""
+    _check_seen("scene.points", np.asarray(scene.points), scene)
+    num = initial_number(scene, system)
+    rows_needed(system.stages()[0], num, system)
+    system.check_initial_number(num)
 
 
-def state_of_checkpoint(scene: Scene, system: System, index: int, resume: Checkpoint, num_devices: int) -> TrainState:
-    """Return the state of a checkpoint of a stage, or, of the end of the stage before, the state before the first
-    iteration."""
-    check_corrections(resume.state.corrections, len(scene.train))
-    if resume.views is not None:
-        resume.views.check(scene.train)
-    num = resume.state.model.gaussians.num
-    if num % num_devices:
-        warnings.warn(
-            f"the checkpoint has {num:,} rows, which {num_devices} devices cannot share evenly: each holds all of them "
-            "until the stage ends",
-            stacklevel=2,
+def _check_seen(name: str, points: np.ndarray, scene: Scene) -> None:
+    if not np.isfinite(points).all():
+        return  # `init_from_points` and `check_model` name them.
+    sights = [Sight.of_camera(view.camera) for view in scene.train]
+    if len(unseeing(points, sights)) == len(sights):
+        raise ValueError(
+            f"{name}: no training view sees any of the {len(points):,} points: they must be in the world of the views' "
+            "cameras; scene.transform leads there from the original world"
         )
-    stages = system.all_stages()
-    state = copied(resume.state)
-    if resume.stage != index:
-        state = continued_state(stages[index - 1], stages[index], state)
-    return with_room(stages[index], state)
 
 
-def copied(tree: T) -> T:
-    """Return a pytree on the device with buffers that a step may take over."""
-    placed: T = jax.device_put(tree, may_alias=False)
-    return placed
-
-
-def with_room(stage: Stage, state: TrainState) -> TrainState:
-    """Return the state, padded for what events will add between steps, so that no step is compiled again."""
-    model = state.model
-    moments = state.moments
-    num = model.num
-    num_bytes = float(model.num_bytes)
-    for event, event_state in zip(stage.events, state.events, strict=True):
-        if isinstance(event, HostEvent) and event_state is not None:
-            with calling(event, "with_room", stage.name):
-                padding = Change(*event.with_room(model, moments, num_bytes, stage.iterations), event_state)
-                padding = checked_change(padding)
-            model = padding.model
-            moments = padding.moments
-        num_bytes = event.most_bytes(num_bytes, num, stage.iterations)
-    return dataclasses.replace(state, model=model, moments=moments)
+def initial_number(scene: Scene, system: System) -> int:
+    """Return the number of initial Gaussians: as requested, at most one for each point, and at most what the first
+    stage has room for."""
+    num = len(scene.points)
+    caps = [event.most_gaussians for event in system.stages()[0].events]
+    return min([num, system.initial_gaussians or num, *(cap for cap in caps if cap is not None)])
 
 
 def initial_model(scene: Scene, system: System) -> Model:
-    """Return Gaussians at the scene's points, as many as the first stage has room for."""
+    """Return Gaussians at the scene's points, as many as the first stage has room for; `check_points` checks them."""
     first = system.stages()[0]
     num = initial_number(scene, system)
     degree = system.initial_sh_degree
@@ -179,44 +144,10 @@ def _largest_sizes(gaussians: Gaussians, cameras: Sequence[Camera]) -> np.ndarra
     return largest
 
 
-def check_start(scene: Scene, system: System) -> None:
-    """Raise ValueError, naming the options to change, if no training view sees any point, or the events of the first
-    stage cannot work with the initial number of Gaussians."""
-    first = system.stages()[0]
-    _check_seen("scene.points", np.asarray(scene.points), scene)
-    num = initial_number(scene, system)
-    rows_needed(first, num, system)
-    system.check_number(num)
+# A given model
 
 
-def _check_seen(name: str, points: np.ndarray, scene: Scene) -> None:
-    if not np.isfinite(points).all():
-        return  # `init_from_points` and `check_model` name them.
-    sights = [Sight.of_camera(view.camera) for view in scene.train]
-    if len(unseeing(points, sights)) == len(sights):
-        raise ValueError(
-            f"{name}: no training view sees any of the {len(points):,} points: they must be in the world of the views' "
-            "cameras; scene.transform leads there from the original world"
-        )
-
-
-def check_loss_data(views: tuple[View, ...], stages: Sequence[Stage]) -> None:
-    """Raise ValueError if losses read depth maps and no view has one, or if a view is too small for their SSIM."""
-    for view in views if any(stage.has_ssim for stage in stages) else ():
-        if min(view.picture.size) < SSIM_WINDOW:
-            height, width = view.picture.size
-            raise ValueError(
-                f"view {view.name} has {width} by {height} pixels, but the loss has SSIM, which needs {SSIM_WINDOW} by "
-                f"{SSIM_WINDOW}: take larger photographs, or set loss.ssim_weight to 0"
-            )
-    if any(stage.has_depths for stage in stages) and all(view.depth is None for view in views):
-        raise ValueError(
-            "loss.depth_weight, or a custom term, needs depth maps, but no training view has one: put them as "
-            "NAME.npy or NAME.png into the folder depths next to images, or leave it out"
-        )
-
-
-def given_start(start: Model, scene: Scene, system: System, index: int) -> Model:
+def given_model(start: Model, scene: Scene, system: System, index: int) -> Model:
     """Return a model that a stage is to start from, with spherical harmonics of the degree at which training begins.
 
     Warns of what the stage leaves out, and of options that do not apply. Raises ValueError if the model is invalid, or,
@@ -229,20 +160,7 @@ def given_start(start: Model, scene: Scene, system: System, index: int) -> Model
     stage = stages[index]
     degree = system.initial_sh_degree
     num = start.num
-    if num < LEAST_LEFT:
-        raise ValueError(f"start must have at least {LEAST_LEFT} Gaussians; got {num}")
-    if index == 0:
-        system.check_number(num)
-    elif system.memory_budget is not None:
-        system.check_given_number(num)
-    for event in stage.events:
-        most = event.most_gaussians
-        if index == 0 and most is not None and num > most:
-            limit = _limit_of(event, system)
-            raise ValueError(
-                f"start must have at most {most:,} Gaussians, for which {limit} has room; got {num:,}: raise {limit}, "
-                f"or start from some of them, such as start[:{most}]"
-            )
+    _check_given_number(num, stage, system, is_first=index == 0)
     if index == 0 and system.initial_gaussians not in (None, num):
         warnings.warn(
             f"initial_gaussians of {system.initial_gaussians:,} does not apply: training starts from the {num:,} "
@@ -279,6 +197,25 @@ def given_start(start: Model, scene: Scene, system: System, index: int) -> Model
     )
 
 
+def _check_given_number(num: int, stage: Stage, system: System, *, is_first: bool) -> None:
+    """Raise ValueError, naming the option, unless a stage can start from a number of given Gaussians."""
+    if num < LEAST_LEFT:
+        raise ValueError(f"start must have at least {LEAST_LEFT} Gaussians; got {num}")
+    if not is_first:
+        if system.memory_budget is not None:
+            system.check_given_number(num)
+        return
+    system.check_initial_number(num)
+    for event in stage.events:
+        most = event.most_gaussians
+        if most is not None and num > most:
+            limit = _limit_of(event, system)
+            raise ValueError(
+                f"start must have at most {most:,} Gaussians, for which {limit} has room; got {num:,}: raise {limit}, "
+                f"or start from some of them, such as start[:{most}]"
+            )
+
+
 def left_out(model: Model, degree: int, template: Appearance | None) -> list[str]:
     """Return in words what a model loses if its spherical harmonics get a degree, and its appearance the options of a
     template, which keeps only the shapes of kernels. Template None: the appearance is kept."""
@@ -308,6 +245,73 @@ def _are_close(similarity: Similarity, other: Similarity) -> bool:
     return all(np.allclose(a, b, rtol=1e-6, atol=1e-6) for a, b in pairs)
 
 
+# The state of a stage
+
+
+def state_of_model(
+    model: Model, stage: Stage, system: System, names: Sequence[str], num_devices: int = 1
+) -> TrainState:
+    """Return the state before the first iteration of a stage that starts from a model, given the names of the training
+    views. The corrections of these in the model's origin continue."""
+    with_rows = padded(copied(model.live), stage, system, num_devices)
+    return with_room(stage, initial_state(stage, with_rows, names, model.origin))
+
+
+def copied(tree: T) -> T:
+    """Return a pytree on the device with buffers that a step may take over."""
+    placed: T = jax.device_put(tree, may_alias=False)
+    return placed
+
+
+def initial_state(stage: Stage, model: Model, names: Sequence[str] = (), origin: Origin | None = None) -> TrainState:
+    """Return the state before the first iteration of a stage, given a model with its rows and appearance, the names of
+    the training views, and the origin of the model that it starts from, whose corrections continue."""
+    events = [event.init(model) if times else None for event, times in zip(stage.events, stage.times, strict=True)]
+    return TrainState(
+        model=model,
+        moments=adam_init(partition(model)[0]),
+        events=tuple(events),
+        iteration=jnp.zeros((), jnp.int32),
+        status=jnp.zeros((), jnp.int32),
+        corrections=initial_corrections(stage.corrections, names, origin, model.gaussians.means.dtype),
+    )
+
+
+def continued_state(before: Stage, stage: Stage, state: TrainState) -> TrainState:
+    """Return the state before the first iteration of a stage that continues the one before, given that one's last
+    state. Events that both stages hold continue as well."""
+    state_of = {id(event): event_state for event, event_state in zip(before.events, state.events, strict=True)}
+    events = []
+    for event, times in zip(stage.events, stage.times, strict=True):
+        event_state = state_of.get(id(event))
+        is_new = event_state is None and bool(times)
+        events.append(event.init(state.model) if is_new else event_state)
+    # Two arrays: the step takes over each buffer once.
+    iteration = jnp.zeros((), jnp.int32)
+    status = jnp.zeros((), jnp.int32)
+    return dataclasses.replace(state, events=tuple(events), iteration=iteration, status=status)
+
+
+def with_room(stage: Stage, state: TrainState) -> TrainState:
+    """Return the state, padded for what events will add between steps, so that no step is compiled again."""
+    model = state.model
+    moments = state.moments
+    num = model.num
+    num_bytes = float(model.num_bytes)
+    for event, event_state in zip(stage.events, state.events, strict=True):
+        if isinstance(event, HostEvent) and event_state is not None:
+            with calling(event, "with_room", stage.name):
+                padding = Change(*event.with_room(model, moments, num_bytes, stage.iterations), event_state)
+                padding = checked_change(padding)
+            model = padding.model
+            moments = padding.moments
+        num_bytes = event.most_bytes(num_bytes, num, stage.iterations)
+    return dataclasses.replace(state, model=model, moments=moments)
+
+
+# Rows
+
+
 def _limit_of(event: Event, system: System) -> str:
     """Return the path of the option that bounds the number of Gaussians of an event."""
     return f"{system.path_of(event)}.{event.limited_by}" if system.memory_budget is None else "memory_budget"
@@ -331,14 +335,6 @@ def rows_needed(stage: Stage, num: int, system: System) -> int:
     return rows
 
 
-def initial_number(scene: Scene, system: System) -> int:
-    """Return the number of initial Gaussians: as requested, at most one for each point, and at most what the first
-    stage has room for."""
-    num = len(scene.points)
-    caps = [event.most_gaussians for event in system.stages()[0].events]
-    return min([num, system.initial_gaussians or num, *(cap for cap in caps if cap is not None)])
-
-
 def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> Model:
     """Return the model with the appearance of a stage and with spare rows for its events.
 
@@ -349,7 +345,7 @@ def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> 
     """
     gaussians = model.gaussians
     shapes = model.appearance.shapes
-    num = model.gaussians.num
+    num = model.num_rows
     for event in stage.events:
         most = event.most_gaussians
         if most is not None and num > most:

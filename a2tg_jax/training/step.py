@@ -11,14 +11,14 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.sharding import Mesh
 
 from a2tg_jax.appearance import Appearance, project_appearance
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians
-from a2tg_jax.core.optim import AdamState, OptStep, adam_init, adam_update
-from a2tg_jax.core.origin import Origin
+from a2tg_jax.core.optim import AdamState, OptStep, adam_update
 from a2tg_jax.core.pytree import combine, partition, pytree
 from a2tg_jax.core.sh import SH_C0
 from a2tg_jax.events import Change, EventInfo, Now, Seen, StepEvent, read_probe
@@ -30,7 +30,6 @@ from a2tg_jax.training.corrections import (
     CorrectionState,
     corrected_camera,
     corrected_color,
-    initial_corrections,
     penalties,
     updated,
 )
@@ -67,11 +66,29 @@ class StepSettings:
     render: RenderSettings
     """Render settings with a capacity."""
     background: Background
-    due: tuple[bool, ...] | None = None
-    """Whether each event of the stage is due; a step is compiled for each pattern. With None the step itself decides,
+    happens: tuple[bool, ...] | None = None
+    """Whether each event of the stage happens; a step is compiled for each pattern. With None the step itself decides,
     which makes a GPU wait for the host."""
     mesh: Mesh | None = None
     """Devices that draw the views; None: one."""
+
+
+class StepInputs(NamedTuple):
+    """What a step reads besides the state; traced."""
+
+    stage: Stage
+    clock: Clock
+    """`stage.clock(iteration)`."""
+    photographs: Photographs
+    """Photographs of one image size."""
+    chosen: Array | np.ndarray | None
+    """[V] int32 indices of the photographs to use; None: all of them."""
+    views: Array | np.ndarray | None
+    """[V] int32, their numbers among all training views; needed for corrections."""
+    scene_scale: Array
+    """Factor of the means' learning rate."""
+    key: Array
+    """Key of the stage; each iteration folds in its number."""
 
 
 class StepInfo(NamedTuple):
@@ -89,36 +106,6 @@ class StepInfo(NamedTuple):
     """Number of Gaussians that events could not add because all rows were taken."""
     terms: dict[str, Array]
     """Summands of the loss by name."""
-
-
-def initial_state(stage: Stage, model: Model, names: Sequence[str] = (), origin: Origin | None = None) -> TrainState:
-    """Return the state before the first iteration of a stage, given a model with its rows and appearance, the names of
-    the training views, and the origin of the model that it starts from, whose corrections continue."""
-    return TrainState(
-        model=model,
-        moments=adam_init(partition(model)[0]),
-        events=tuple(
-            event.init(model) if times else None for event, times in zip(stage.events, stage.times, strict=True)
-        ),
-        iteration=jnp.zeros((), jnp.int32),
-        status=jnp.zeros((), jnp.int32),
-        corrections=initial_corrections(stage.corrections, names, origin, model.gaussians.means.dtype),
-    )
-
-
-def continued_state(before: Stage, stage: Stage, state: TrainState) -> TrainState:
-    """Return the state before the first iteration of a stage that continues the one before, given that one's last
-    state. Events that both stages hold continue as well."""
-    state_of = {id(event): event_state for event, event_state in zip(before.events, state.events, strict=True)}
-    events = []
-    for event, times in zip(stage.events, stage.times, strict=True):
-        event_state = state_of.get(id(event))
-        is_new = event_state is None and bool(times)
-        events.append(event.init(state.model) if is_new else event_state)
-    # Two arrays: the step takes over each buffer once.
-    iteration = jnp.zeros((), jnp.int32)
-    status = jnp.zeros((), jnp.int32)
-    return dataclasses.replace(state, events=tuple(events), iteration=iteration, status=status)
 
 
 class BatchGradients(NamedTuple):
@@ -153,31 +140,16 @@ class Attempt(NamedTuple):
 def jitted_step() -> jax.stages.Wrapped:
     """Return `train_step`, jitted, with the state's buffers donated."""
     # Made at the first call: importing this library calls no `jax.jit`.
-    return jax.jit(train_step, static_argnums=(0,), donate_argnums=(3,))
+    return jax.jit(train_step, static_argnums=(0,), donate_argnums=(1,))
 
 
-def train_step(
-    settings: StepSettings, stage: Stage, clock: Clock, state: TrainState, photographs: Photographs,
-    views: Array | None, scene_scale: Array, key: Array, rows: Array | None = None,
-) -> tuple[TrainState, StepInfo]:  # fmt: skip
-    """Run one iteration.
-
-    Args:
-      settings: static.
-      stage: its numbers are traced.
-      clock: `stage.clock(iteration)`.
-      state: donated.
-      photographs: of one image size.
-      views: [V] int32 indices of the photographs to use; None: all of them.
-      scene_scale: factor of the means' learning rate.
-      key: of the stage; each iteration folds in its number.
-      rows: [V] int32, their numbers among all training views; needed for corrections.
-    """
-    tried = attempt(settings, stage, clock, state, photographs, views, scene_scale, key, rows)
+def train_step(settings: StepSettings, state: TrainState, inputs: StepInputs) -> tuple[TrainState, StepInfo]:
+    """Run one iteration. The settings are static; the state is donated."""
+    tried = attempt(settings, state, inputs)
     drawn = tried.views
     # The last assignment wins: after an overflow all other numbers are meaningless.
     status = jnp.where(tried.info.is_possible, FINE, IMPOSSIBLE)
-    status = jnp.where(jnp.mean(drawn.loss) > clock.largest_loss, EXPLODED, status)
+    status = jnp.where(jnp.mean(drawn.loss) > inputs.clock.largest_loss, EXPLODED, status)
     status = jnp.where(tried.is_finite, status, NOT_FINITE)
     status = jnp.where(jnp.any(drawn.is_overflow), OVERFLOW, status).astype(jnp.int32)
     status = jnp.where(state.status == FINE, status, state.status)
@@ -188,32 +160,32 @@ def train_step(
     chosen = with_rows_divided(settings.mesh, chosen)
     return chosen, StepInfo(
         loss=jnp.mean(drawn.loss), psnr=jnp.mean(drawn.psnr), num_pairs=jnp.max(drawn.num_pairs), status=status,
-        num_live=chosen.model.num_live, num_refused=jnp.asarray(tried.info.num_refused),
+        num_live=chosen.model.num_live, num_refused=tried.info.num_refused,
         terms=jax.tree.map(jnp.mean, drawn.terms),
     )  # fmt: skip
 
 
-def attempt(
-    settings: StepSettings, stage: Stage, clock: Clock, state: TrainState, photographs: Photographs,
-    views: Array | None, scene_scale: Array, key: Array, rows: Array | None = None,
-) -> Attempt:  # fmt: skip
-    """Return the outcome of one iteration. Same arguments as `train_step`; none is donated."""
+def attempt(settings: StepSettings, state: TrainState, inputs: StepInputs) -> Attempt:
+    """Return the outcome of one iteration; nothing is donated."""
+    stage = inputs.stage
+    clock = inputs.clock
+    scene_scale = inputs.scene_scale
     iteration = state.iteration + 1
     model = state.model
     num_keys = sum(event.num_keys for event in stage.events if isinstance(event, StepEvent))
     # By iteration, so that repeated and resumed steps draw the same numbers.
-    keys = jax.random.split(jax.random.fold_in(key, iteration), 1 + num_keys)
+    keys = jax.random.split(jax.random.fold_in(inputs.key, iteration), 1 + num_keys)
     dtype = model.gaussians.means.dtype
-    batch = photographs.of(views, dtype)
+    batch = inputs.photographs.of(inputs.chosen, dtype)
     if settings.background == "random":
         backgrounds = jax.random.uniform(keys[0], (len(batch.viewmats), 3), dtype)
     else:
         backgrounds = jnp.full((len(batch.viewmats), 3), 1.0 if settings.background == "white" else 0.0, dtype)
-    correction_rows = tuple(correction.rows[rows] for correction in state.corrections)
+    correction_rows = tuple(correction.rows[inputs.views] for correction in state.corrections)
     is_gathering = False
     for event, event_state in zip(stage.events, state.events, strict=True):
         is_gathering |= event_state is not None and event.statistic is not None
-    drawn = batch_gradients(settings, stage, clock, model, batch, backgrounds, iteration, correction_rows, is_gathering)
+    drawn = batch_gradients(settings, inputs, model, batch, backgrounds, iteration, correction_rows, is_gathering)
     of_gaussians, of_appearance, of_corrections = drawn.grads
     # Gradients of corrections belong to one view each.
     grads = jax.tree.map(lambda g: jnp.mean(g, axis=0), (of_gaussians, of_appearance))
@@ -229,14 +201,14 @@ def attempt(
     seen = _seen(stage, batch, correction_rows, drawn)
     num_iterations = jnp.asarray(clock.num_iterations)
     now = Now(keys[1:], clock.scheduled(iteration), stage.cooled(rate, progress), num_iterations, scene_scale)
-    change, events = _events(settings.due, stage, clock, now, seen, model, moments, state.events)
+    change = _after_events(settings, inputs, now, seen, Change(model, moments, state.events))
     corrections = tuple(
-        updated(correction, correction_state, rows, grad, progress)  # type: ignore[arg-type]
+        updated(correction, correction_state, inputs.views, grad, progress)  # type: ignore[arg-type]
         for correction, correction_state, grad in zip(stage.corrections, state.corrections, of_corrections, strict=True)
     )
-    after = TrainState(change.model, change.moments, events, iteration, state.status, corrections)
+    after = TrainState(change.model, change.moments, change.state, iteration, state.status, corrections)
     changed: Any = partition(change.model)[0]
-    if settings.due is not None:
+    if settings.happens is not None:
         # Adam's results are finite if the gradients are. Only leaves that a projection or an event has changed, which
         # are other tracers, are checked, because the check makes a GPU write a leaf twice.
         ids_after_adam = {id(leaf) for leaf in jax.tree.leaves(step.params)}
@@ -274,8 +246,7 @@ def _are_finite(leaves: Sequence[Array]) -> Array:
 
 def batch_gradients(
     settings: StepSettings,
-    stage: Stage,
-    clock: Clock,
+    inputs: StepInputs,
     model: Model,
     batch: Photographs,
     backgrounds: Array,
@@ -288,6 +259,8 @@ def batch_gradients(
     Backgrounds are [V, 3]; `correction_rows` has the rows [V, ...] of each correction. `is_gathering`: whether an event
     still gathers the stage's statistic.
     """
+    stage = inputs.stage
+    clock = inputs.clock
     height, width = batch.images.shape[1:3]
     highest = settings.render.sh_degree
     degree = jnp.minimum((iteration - 1) // clock.sh_interval, highest) if stage.raises_sh_degree else highest
@@ -357,46 +330,43 @@ def optimized(stage: Stage, state: TrainState, grads: Any, rate_of_means: Array,
     return adam_update(floats, grads, state.moments, rates)
 
 
-def _applied(event: StepEvent, now: Now, carry: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Return model, moments and state after an event, which must keep their shapes, and its information."""
-    model, moments, state = carry
-    with calling(event, "apply"):
-        change = checked_change(event.apply(now, model, moments, state))
-        check_kept("model", change.model, model)
-        check_kept("state", change.state, state)
-    is_possible, num_refused = change.info
-    info = EventInfo(jnp.asarray(is_possible), jnp.asarray(num_refused, jnp.int32))
-    return change.model, change.moments, change.state, info
-
-
-def _events(
-    due: tuple[bool, ...] | None, stage: Stage, clock: Clock, now: Now, seen: Seen, model: Model,
-    moments: AdamState, states: Sequence[Any],
-) -> tuple[Change, tuple[Any, ...]]:  # fmt: skip
-    """Gather statistics for the events, and apply those inside the step, which must keep all shapes."""
-    nothing = EventInfo(jnp.asarray(True), jnp.zeros((), jnp.int32))
-    infos = nothing
+def _after_events(settings: StepSettings, inputs: StepInputs, now: Now, seen: Seen, change: Change) -> Change:
+    """Return the change by Adam followed by the events inside the step. Its `state` is a tuple of the state of each
+    event of the stage, which gathers its statistic first."""
+    states = change.state
+    change = change._replace(info=EventInfo(jnp.asarray(True), jnp.zeros((), jnp.int32)))
     new_states = []
     first_key = 0
-    for place, (event, num_left, state) in enumerate(zip(stage.events, clock.num_left, states, strict=True)):
+    for place, (event, num_left) in enumerate(zip(inputs.stage.events, inputs.clock.num_left, strict=True)):
+        state = states[place]
         if state is not None and event.observes:
-            observed = event.observe(state, model, seen)
+            observed = event.observe(state, change.model, seen)
             check_kept(f"{type(event).__name__}.observe", observed, state)
             state = observed
         if isinstance(event, StepEvent):
             keys = now.keys[first_key : first_key + event.num_keys]
-            of_event = now._replace(keys=keys, num_left=None if num_left is None else jnp.asarray(num_left, jnp.int32))
             first_key += event.num_keys
-            carry = (model, moments, state)
+            of_event = now._replace(keys=keys, num_left=None if num_left is None else jnp.asarray(num_left, jnp.int32))
             apply = functools.partial(_applied, event, of_event)
+            change = change._replace(state=state)
             if num_left is None:  # It happens after every iteration.
-                model, moments, state, info = apply(carry)
-            elif state is None:  # It is past.
-                info = nothing
-            elif due is None:  # The step itself decides.
-                model, moments, state, info = jax.lax.cond(num_left > 0, apply, lambda carry: (*carry, nothing), carry)
-            else:
-                model, moments, state, info = apply(carry) if due[place] else (*carry, nothing)
-            infos = EventInfo(infos.is_possible & info.is_possible, infos.num_refused + info.num_refused)
+                change = apply(change)
+            elif state is not None:  # It is not past.
+                if settings.happens is None:  # The step itself decides.
+                    change = jax.lax.cond(num_left > 0, apply, lambda before: before, change)
+                elif settings.happens[place]:
+                    change = apply(change)
+            state = change.state
         new_states.append(state)
-    return Change(model, moments, None, infos), tuple(new_states)
+    return change._replace(state=tuple(new_states))
+
+
+def _applied(event: StepEvent, now: Now, before: Change) -> Change:
+    """Return a change followed by an event, which must keep the shapes of model and state."""
+    with calling(event, "apply"):
+        change = checked_change(event.apply(now, before.model, before.moments, before.state))
+        check_kept("model", change.model, before.model)
+        check_kept("state", change.state, before.state)
+    is_possible = before.info.is_possible & jnp.asarray(change.info.is_possible)
+    num_refused = before.info.num_refused + jnp.asarray(change.info.num_refused, jnp.int32)
+    return Change(change.model, change.moments, change.state, EventInfo(is_possible, num_refused))

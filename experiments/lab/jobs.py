@@ -17,12 +17,12 @@ import jax
 import numpy as np
 
 import a2tg_jax as a2tg
+from a2tg_jax.base.even_spacing import evenly_chosen
 from a2tg_jax.base.json_text import read_json
 from a2tg_jax.base.memory import tidy_memory
 from a2tg_jax.base.threads import num_threads
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.gaussians import floats_per_gaussian, no_rows
-from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.origin import WHITE
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.data.assembly import with_validation_views
