@@ -107,12 +107,11 @@ def main() -> None:
         serve()
         return
     servers = [started(checkout.resolve()) for checkout in (args.against, pathlib.Path(__file__).parents[1])]
-    print("| model | pass | there, ms | here, ms | here / there |\n| --- | --- | --- | --- | --- |")
     for path in args.models:
         for name in PASSES:
             turns = [[asked(server, path, name) for server in servers] for _ in range(args.turns)]
             there, here = np.min(turns, axis=0)
-            print(f"| {path} | {name} | {there:.2f} | {here:.2f} | {here / there:.2f} |", flush=True)
+            print(f"{path} {name}: {here:.2f} ms, there {there:.2f} ms, ratio {here / there:.2f}", flush=True)
     for server in servers:
         server.communicate()
 

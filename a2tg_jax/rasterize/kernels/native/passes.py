@@ -61,7 +61,7 @@ def blocks_at_once(settings: PassSettings) -> int:
 def pixel_order(tile_size: int, lanes: int) -> np.ndarray:
     """Return the pixels of a tile, counted row by row, in the order of its blocks of some lanes.
 
-    If rectangles of so many pixels fill the tile, blocks are compact: they see fewer splats and texels than rows do.
+    If rectangles of as many pixels fill the tile, blocks are compact: they see fewer splats and texels than rows do.
     """
     # 2ᵏ lanes: 2^⌊k/2⌋ rows, as 2×4 for 8 lanes.
     height = 1 << (lanes.bit_length() - 1) // 2
