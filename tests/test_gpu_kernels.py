@@ -24,7 +24,7 @@ from a2tg_jax import Appearance, RenderSettings, Texture, TextureOptions, combin
 from a2tg_jax.appearance import StaticShading
 from a2tg_jax.rasterize.kernels.cuda import nvrtc
 from a2tg_jax.rasterize.kernels.cuda.source import PRIMITIVES, Argument, c_function, source
-from a2tg_jax.rasterize.kernels.jaxprs import Untranslatable, example, trace
+from a2tg_jax.rasterize.kernels.jaxprs import Untranslatable, trace
 from a2tg_jax.rasterize.kernels.native import lanes as of_native
 from a2tg_jax.rasterize.splats import PassSettings
 from a2tg_jax.rasterize.tiles import TileGrid
@@ -177,7 +177,7 @@ def test_printed_functions_compute_what_xla_does(dtype):
 
     numbers = [0.0, -0.0, 1.5, -2.75, 0.1, 31.0, -1e-3, np.inf, -np.inf, np.nan, 3e9, -3e9]
     x, y = (np.array(pair, dtype) for pair in zip(*[(a, b) for a in numbers for b in numbers], strict=True))
-    closed, _ = trace(program, example(dtype), example(dtype))
+    closed, _ = trace(program, *[jax.ShapeDtypeStruct((), dtype)] * 2)
     real = {"float32": "float", "float64": "double"}[dtype]
     wanted = jax.jit(jax.vmap(program))(x, y)
     found = opencl.evaluate(closed, real, x, y)
@@ -191,6 +191,6 @@ def test_printed_functions_compute_what_xla_does(dtype):
     [(lax.digamma, "'digamma'"), (lambda x: x.astype(jnp.bfloat16).astype(x.dtype), "bfloat16")],
 )
 def test_what_cannot_be_printed_is_named(function, words):
-    closed, _ = trace(function, example("float32"))
+    closed, _ = trace(function, jax.ShapeDtypeStruct((), "float32"))
     with pytest.raises(Untranslatable, match=words):
         c_function("f", closed, [Argument("x")], [Argument("y")])

@@ -43,7 +43,6 @@ from a2tg_jax.host.errors import error_text
 from a2tg_jax.results import compression, run_evaluation, run_training, stage_training
 from a2tg_jax.results.folder import OLD, RunFolder, old_run, opened, put_back_old, set_aside
 from a2tg_jax.results.model_source import open_source
-from a2tg_jax.results.output_paths import check_apart
 from a2tg_jax.results.record import RunRecord, SceneSource, read_record, read_run_file, write_record
 from a2tg_jax.results.run_training import RunOptions, train_run
 from a2tg_jax.training.batches import BatchOrder
@@ -297,11 +296,19 @@ def test_an_unfinished_replacement_never_costs_the_finished_run(tmp_path):
 # Before training
 
 
-def test_the_run_folder_and_the_scene_must_not_overlap(tmp_path):
-    for out, scene in ((tmp_path / "scene/run", tmp_path / "scene"), (tmp_path, tmp_path / "scene")):
-        with pytest.raises(ValueError, match="overlap: choose an output folder"):
-            check_apart(out, scene)
-    check_apart(tmp_path / "scene-run", tmp_path / "scene")
+@pytest.mark.parametrize(
+    ("out", "message"),
+    [
+        ("scene/run", "overlap: choose an output folder"),
+        (".", "overlap: choose an output folder"),
+        ("scene-run", "has no sparse model"),
+    ],
+)
+def test_the_run_folder_and_the_scene_must_not_overlap(tmp_path, monkeypatch, capsys, out, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene").mkdir()
+    assert cli.main(["train", "scene", "--out", out]) == 2
+    assert message in capsys.readouterr().err
 
 
 def test_a_full_disk_is_seen_before_training(tmp_path, monkeypatch, capsys):

@@ -26,7 +26,6 @@ from scenes_random import (
 
 import a2tg_jax as a2tg
 from a2tg_jax.rasterize.views import render_traced
-from a2tg_jax.render import appearance_of
 
 EPSILON = 3e-6
 """Step of the central differences: losses of about 50 round off to 50·1e-16/ε = 2e-9, and steps of 1e-6 and 1e-5 were
@@ -308,7 +307,7 @@ def test_statistics_are_the_closed_forms_of_the_oracle(rules, settings, cases):
         cotangent = np.random.default_rng(seed).normal(size=(scene.height, scene.width, 3))
         inputs = Inputs(*(a2tg.combine(*as_inputs(scene, "float64"))))
         gradient = jitted_statistic(settings, which, (scene.width, scene.height))
-        appearance = appearance_of(inputs.gaussians, inputs.textures, settings)
+        appearance = a2tg.Appearance(texture=a2tg.Texture(inputs.textures, options=settings.texture))
         given = inputs.gaussians, inputs.viewmat, inputs.K, appearance, inputs.background, jnp.asarray(cotangent)
         found = np.asarray(gradient(jnp.zeros((len(scene.means), 4)), *given))
         expected = oracle.gradient_statistic(scene, cotangent, rules, which)

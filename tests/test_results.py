@@ -42,14 +42,14 @@ from a2tg_jax import (
     view_image,
 )
 from a2tg_jax.base.text import in_bytes
-from a2tg_jax.cli import main as cli, runs
+from a2tg_jax.cli import main as cli
 from a2tg_jax.measure import evaluation
 from a2tg_jax.results.commands import repeating_command
 from a2tg_jax.results.folder import OLD, RunFolder, check_free, drop_old, open_run, set_aside
 from a2tg_jax.results.history import EventWriter, read_history, write_history
 from a2tg_jax.results.images import to_uint8
 from a2tg_jax.results.info import describe_run
-from a2tg_jax.results.output_paths import check_export, check_new, check_output
+from a2tg_jax.results.output_paths import check_export, check_output
 from a2tg_jax.results.plan import plan_run
 from a2tg_jax.results.record import RunRecord, SceneSource, contradictions, read_record, read_run_file, write_record
 from a2tg_jax.results.report import (
@@ -271,13 +271,14 @@ def a_model():
         ("export model.npz --web site", "site/photographs.json", "photographs.json exists"),
         ("compress model.npz --out x.a2tgz", "x.a2tgz", "x.a2tgz exists; add --overwrite"),
         ("mesh run", "run/mesh.glb", "mesh.glb exists; add --overwrite"),
+        ("convert model.npz x.ply", "x.ply", "x.ply exists; add --overwrite"),
         ("export scene.ply --overwrite --single-file --web scene.ply", "", "the model itself; choose another --web"),
     ],
 )
 def test_files_are_not_replaced_without_a_flag(tmp_path, monkeypatch, capsys, words, mine, message):
     """Nor is another output of the same command written then."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(runs, "open_source", lambda *_: None)
+    monkeypatch.setattr("a2tg_jax.results.model_source.open_source", lambda *_: None)
     with_record(tmp_path / "run", RunRecord(SceneSource("synthetic")))
     a2tg.save_model("model.npz", a_model())
     a2tg.save_ply("scene.ply", a_model())
@@ -313,16 +314,13 @@ def test_exports_into_a_run_are_replaced_by_default_or_on_request(tmp_path, name
     check_export(path, path, "--out", overwrite=False)
     with contextlib.nullcontext() if is_export else pytest.raises(ValueError, match="belongs to the run"):
         check_export(path, tmp_path / "other", "--out", overwrite=True)
-    if is_export:
-        with pytest.raises(FileExistsError, match="add `overwrite`"):
-            check_new(path, "OUT", overwrite=False)
 
 
 def test_the_mesh_of_a_run_is_replaced_by_default_once_the_command_has_written_it(tmp_path, monkeypatch):
     with_record(tmp_path, RunRecord(SceneSource("synthetic")))
     out = tmp_path / "mesh.glb"
-    monkeypatch.setattr(runs, "open_source", lambda *_: None)
-    monkeypatch.setattr(runs, "write_mesh", lambda source, out, *_: out.write_text("mesh"))
+    monkeypatch.setattr("a2tg_jax.results.model_source.open_source", lambda *_: None)
+    monkeypatch.setattr("a2tg_jax.results.meshing.write_mesh", lambda source, out, *_: out.write_text("mesh"))
     out.write_text("mine")
     for words in (["--overwrite"], [], ["--out", str(out)]):
         assert cli.main(["mesh", str(tmp_path), *words]) == 0 and out.read_text() == "mesh"
