@@ -39,7 +39,7 @@ def refusal(kernel: PassSettings) -> str | None:
 def forward(settings: PassSettings, inputs: PassInputs) -> tuple[Array, Array]:
     """Return channels [tiles, D, P] and transmittance [tiles, P], as `xla.forward` does."""
     shape = settings.grid.num, settings.num_channels + 1, settings.num_pixels
-    name = _registered(settings.kernel, "forward", _forward_handler)
+    name = _registered(settings.kernel_settings, "forward", _forward_handler)
     packed = _packed(settings, inputs)
     (image,) = ffi.call(name, [(shape, inputs.splats.M.dtype)], *packed)
     return image[:, :-1], image[:, -1]
@@ -52,7 +52,7 @@ def backward(
     dtype = inputs.splats.M.dtype
     cotangents = [array.astype(dtype) for array in (g, suffix_sum, jacobian)]
     shapes = [(shape, dtype) for shape in settings.gradient_shapes(inputs)]
-    name = _registered(settings.kernel, "backward", _backward_handler)
+    name = _registered(settings.kernel_settings, "backward", _backward_handler)
     gradients = ffi.call(name, shapes, *_packed(settings, inputs), *cotangents)
     return unpack_gradients(settings, gradients, inputs, probe)
 
