@@ -287,5 +287,6 @@ def test_a_bake_of_a_run_is_kept(tmp_path, monkeypatch, capsys):
 def test_a_file_that_cannot_be_written_is_refused_before_baking(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "pxr", None)
     monkeypatch.setattr(conversion, "open_source", lambda *_: pytest.fail("the model was read"))
+    (tmp_path / "a.npz").touch()
     assert main(["convert", str(tmp_path / "a.npz"), str(tmp_path / "b.usdz"), "--bake"]) == 2
     assert "pip install" in capsys.readouterr().err
