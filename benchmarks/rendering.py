@@ -15,7 +15,7 @@ def measure_render(case: dict) -> dict:
     """Measure the image of the random workload, and the gradient of L1 against a fixed random image."""
     gaussians, camera = random_scene(case["num"], case["width"], case["height"])
     textures = random_textures(case["num"], case.get("textures", "none"))
-    settings = a2tg_jax.RenderSettings(compositor=case.get("compositor", "auto"), tile_size=case.get("tile_size", 8))
+    settings = a2tg_jax.RenderSettings(compositor=case.get("compositor", "auto"), tile_size=case.get("tile_size", 16))
     settings = a2tg_jax.plan_render(gaussians, camera, textures, settings=settings)
     target = jnp.asarray(random_image(camera.width, camera.height))
 

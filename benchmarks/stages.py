@@ -24,7 +24,7 @@ def measure_stages(case: dict) -> dict:
     height = case["height"]
     gaussians, camera = random_scene(num, width, height)
     textures = random_textures(num, case.get("textures", "none"))
-    settings = a2tg_jax.RenderSettings(tile_size=case.get("tile_size", 8))
+    settings = a2tg_jax.RenderSettings(tile_size=case.get("tile_size", 16))
     settings = a2tg_jax.plan_render(gaussians, camera, textures, settings=settings)
     capacity = settings.capacity or 0
     appearance = appearance_of(gaussians, textures, settings)
@@ -68,7 +68,7 @@ def measure_stages(case: dict) -> dict:
 def measure_step(case: dict) -> dict:
     """Measure a whole training step, between two events."""
     kind = case.get("textures", "none")
-    tile_size = case.get("tile_size", 8)
+    tile_size = case.get("tile_size", 16)
     system, index = ("gaussians-2d-mcmc", 0) if kind == "none" else ("a2tg", 1)
     textures = random_textures(case["num"], kind)
     size = case["width"], case["height"]

@@ -12,6 +12,7 @@ from toy_system import Toy
 
 from a2tg_jax import (
     Camera,
+    CloneSplitPrune,
     Exposure,
     Gaussians2d,
     Gaussians2dMcmc,
@@ -179,7 +180,13 @@ def test_every_system_has_them_and_none_has_by_default(name):
 
 @pytest.mark.long
 def test_batches_of_another_system_learn_them(scene):
-    system = Gaussians2d(stage1_iterations=4, stage2_iterations=0, initial_gaussians=40, exposure=True, batch_size=2)
+    sizes = {
+        "stage1_iterations": 4,
+        "stage2_iterations": 0,
+        "initial_gaussians": 40,
+        "densify": CloneSplitPrune(cap=60),
+    }
+    system = Gaussians2d(**sizes, exposure=True, batch_size=2)
     origin = fit(scene, system).model.origin
     assert np.abs(origin.corrections["exposure"][: len(scene.train)] - np.eye(3, 4)).max() > 1e-3
 

@@ -152,7 +152,7 @@ def _by_platform(name: str, settings: PassSettings, results: Any, *arrays: objec
 
 def _pass_on(platform: str, name: str, settings: PassSettings) -> Any:
     kernels = _kernels(settings.compositor, platform)
-    reason = None if kernels is xla else kernels.refusal(settings.kernel)
+    reason = None if kernels is xla else kernels.refusal(settings.kernel_settings)
     if reason:
         instead_of(settings.compositor, type(settings.static.appearance), reason)
         kernels = xla

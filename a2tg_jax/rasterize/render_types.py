@@ -27,7 +27,7 @@ class RenderSettings(NamedFields):
       (36, 48, 3)
     """
 
-    tile_size: int = 8
+    tile_size: int = 16
     """Side of a tile in pixels, 1 to 64; it does not change the image."""
     near_plane: float = NEAR_PLANE
     """Least depth of visible splats and hits, in units of the world; positive. If you scale the world, scale near_plane

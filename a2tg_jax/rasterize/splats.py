@@ -61,7 +61,7 @@ class PassSettings(NamedTuple):
     """Number of tiles that XLA composites at once; 0: all. None: one for the platform, set where that is known."""
 
     @property
-    def kernel(self) -> "PassSettings":
+    def kernel_settings(self) -> "PassSettings":
         """The settings that kernels are compiled for: all but the size of the image and what runs them."""
         return self._replace(grid=TileGrid(0, 0, self.grid.tile_size), compositor="auto", tile_batch=None)
 

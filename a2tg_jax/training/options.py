@@ -136,7 +136,7 @@ class System(NamedFields):
     """Highest degree of spherical harmonics, 0 to 3."""
     seed: int = 0
     """Seed of all random numbers."""
-    tile_size: int = 8
+    tile_size: int = 16
     """Side of a tile in pixels. Results do not depend on it."""
     loss: LossConfig = dataclasses.field(default_factory=LossConfig)
     """Weights of the loss."""

@@ -14,6 +14,8 @@ PACKAGE = "a2tg_jax"
 LATER_FIELDS = {"continues", "extent"}
 """Fields that came after the first records, which keep their keys: at their default they are no part of a fingerprint.
 """
+TILE_SIZE = 8
+"""Tile size in all fingerprints, the one of the first records: it changes results only by rounding."""
 
 
 def fingerprint(system: a2tg.System, index: int) -> str:
@@ -24,6 +26,7 @@ def fingerprint(system: a2tg.System, index: int) -> str:
     Raises:
       ValueError: if a stage holds a function without such a name, or a value that nothing is known of.
     """
+    system = dataclasses.replace(system, tile_size=TILE_SIZE)
     return repr((common_options(system), _described(system.stages()[index])))
 
 

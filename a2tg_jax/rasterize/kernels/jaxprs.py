@@ -16,8 +16,10 @@ from jax.extend import core
 from jax.typing import ArrayLike, DTypeLike
 
 from a2tg_jax.core.bilinear import Lookup, Sample, TextureRegion
+from a2tg_jax.core.geometry import Outline
 from a2tg_jax.rasterize import pixel
 from a2tg_jax.rasterize.splats import PassSettings
+from a2tg_jax.rasterize.tiles import outline_touches
 
 Equation = core.JaxprEqn
 V = TypeVar("V")
@@ -180,6 +182,8 @@ class PixelFunctions:
         self.num_planes = structure.num_leaves
         planes = jax.tree.unflatten(structure, [number] * structure.num_leaves)
         self.prepare_vjp, _ = trace(_planes_vjp, splat.M, tile, planes)
+        outline = Outline._make([number] * (len(Outline._fields) - 1) + [flag])
+        self.touches, _ = trace(outline_touches, outline, *(number,) * 4)
         self.reach, _ = trace(self._reach, planes, region, number, number)
         at_pixel = (number, number, number, flag)
         channels = (number,) * settings.num_channels

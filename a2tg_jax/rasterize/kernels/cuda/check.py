@@ -44,7 +44,7 @@ def _failure() -> str | None:
         return None
     driver = Path("/proc/driver/nvidia/version")
     version = driver.read_text(encoding="utf-8") if driver.is_file() else cuda_of_driver()
-    key = version, device.device_kind, jax.__version__, jaxlib_version, source(_inputs()[0].kernel, "cuda")
+    key = version, device.device_kind, jax.__version__, jaxlib_version, source(_inputs()[0].kernel_settings, "cuda")
     # An empty file means that the kernels agree.
     file = cache_folder() / f"cuda-kernels-{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.txt"
     with contextlib.suppress(OSError):

@@ -36,7 +36,7 @@ def forward(settings: PassSettings, inputs: PassInputs) -> tuple[Array, Array]:
     """Return channels [tiles, D, P] and transmittance [tiles, P], as `xla.forward` does."""
     size = settings.grid.num, settings.num_channels + 1, settings.num_pixels
     shape = jax.ShapeDtypeStruct(size, inputs.splats.M.dtype)
-    (image,) = launch(settings.kernel, "forward", settings.grid.num, pack_inputs(settings, inputs), [shape])
+    (image,) = launch(settings.kernel_settings, "forward", settings.grid.num, pack_inputs(settings, inputs), [shape])
     return image[:, :-1], image[:, -1]
 
 
@@ -48,7 +48,7 @@ def backward(
     operands = (*pack_inputs(settings, inputs), *(array.astype(dtype) for array in (g, suffix_sum, jacobian)))
     # Blocks add to these atomically: they start as zeros, and are operands that the call returns.
     totals = [jnp.zeros(shape, dtype) for shape in settings.gradient_shapes(inputs)]
-    gradients = launch(settings.kernel, "backward", settings.grid.num, operands, [], totals)
+    gradients = launch(settings.kernel_settings, "backward", settings.grid.num, operands, [], totals)
     return unpack_gradients(settings, gradients, inputs, probe)
 
 

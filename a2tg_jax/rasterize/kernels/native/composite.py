@@ -18,11 +18,11 @@ from a2tg_jax.rasterize.kernels.jaxprs import refusal_of
 from a2tg_jax.rasterize.kernels.native import ffi
 from a2tg_jax.rasterize.kernels.native.lists import list_functions
 from a2tg_jax.rasterize.kernels.native.llvm_code import CompiledFunction
-from a2tg_jax.rasterize.kernels.native.passes import BACKWARD_BYTES, FORWARD_BYTES, compiled_passes, packed_pixels
+from a2tg_jax.rasterize.kernels.native.passes import compiled_passes, packed_outlines, packed_pixels
 from a2tg_jax.rasterize.splats import PassInputs, PassSettings, Splats, pack_inputs, unpack_gradients
 from a2tg_jax.rasterize.tiles import TileGrid, TileLists
 
-PAIRS_PER_THREAD = 2_000
+PAIRS_PER_THREAD = 1_000
 """Least number of pairs that is worth another thread."""
 SPLATS_PER_THREAD = 10_000
 """Least number of splats that is worth another thread."""
@@ -39,8 +39,8 @@ def refusal(kernel: PassSettings) -> str | None:
 def forward(settings: PassSettings, inputs: PassInputs) -> tuple[Array, Array]:
     """Return channels [tiles, D, P] and transmittance [tiles, P], as `xla.forward` does."""
     shape = settings.grid.num, settings.num_channels + 1, settings.num_pixels
-    name = _registered(settings.kernel, "forward", _forward_handler)
-    packed = _packed(settings, inputs, FORWARD_BYTES)
+    name = _registered(settings.kernel_settings, "forward", _forward_handler)
+    packed = _packed(settings, inputs)
     (image,) = ffi.call(name, [(shape, inputs.splats.M.dtype)], *packed)
     return image[:, :-1], image[:, -1]
 
@@ -52,15 +52,16 @@ def backward(
     dtype = inputs.splats.M.dtype
     cotangents = [array.astype(dtype) for array in (g, suffix_sum, jacobian)]
     shapes = [(shape, dtype) for shape in settings.gradient_shapes(inputs)]
-    name = _registered(settings.kernel, "backward", _backward_handler)
-    gradients = ffi.call(name, shapes, *_packed(settings, inputs, BACKWARD_BYTES), *cotangents)
+    name = _registered(settings.kernel_settings, "backward", _backward_handler)
+    gradients = ffi.call(name, shapes, *_packed(settings, inputs), *cotangents)
     return unpack_gradients(settings, gradients, inputs, probe)
 
 
-def _packed(settings: PassSettings, inputs: PassInputs, vector_bytes: int) -> tuple[Array, ...]:
+def _packed(settings: PassSettings, inputs: PassInputs) -> tuple[Array, ...]:
     """Return `pack_inputs`, with the pixels of the tiles before the last."""
     *packed, size = pack_inputs(settings, inputs)
-    return (*packed, packed_pixels(settings, inputs.lists.pixels, vector_bytes), size)
+    outlines = packed_outlines(settings, inputs.splats.M, inputs.cutoff)
+    return (*packed, outlines, packed_pixels(settings, inputs.lists.pixels), size)
 
 
 def _registered(

@@ -99,14 +99,44 @@ class Lanes:
         function = module.globals.get(f"llvm.{name}") or ir.Function(module, function_type, f"llvm.{name}")
         return self.builder.call(function, operands, fastmath=flags)
 
-    def sum(self, value: ir.Value) -> ir.Value:
-        """Sum over lanes, in an order of LLVM's choice."""
-        if self.width == 1:
-            return value
-        scalar = value.type.element
-        operands = [ir.Constant(scalar, 0.0), value]
-        flags = ("reassoc", "nsz", "contract")
-        return self.call(f"vector.reduce.fadd.{suffix(value.type)}", scalar, operands, flags)
+    def sums(self, values: Sequence[ir.Value]) -> list[ir.Value]:
+        """Return the sum over lanes of each vector."""
+        sums: list[ir.Value] = []
+        for first in range(0, len(values), self.width):
+            some = values[first : first + self.width]
+            vector = self.sums_in_lanes(some)
+            sums += [self.builder.extract_element(vector, INT(k)) for k in range(len(some))]
+        return sums
+
+    def sums_in_lanes(self, values: Sequence[ir.Value]) -> ir.Value:
+        """Return a vector with the sum over lanes of vector k in lane k, for up to `width` vectors.
+
+        It has as many lanes as vectors, rounded up to a power of two.
+        """
+        b = self.builder
+        count = 1 << (len(values) - 1).bit_length()
+        values = [*values, *[ir.Constant(values[0].type, None)] * (count - len(values))]
+        stride = 1
+        while len(values) > 1:
+            # Two vectors become one of half their lanes' sums: lanes whose index has the bit `stride` are the second's.
+            # Nine instructions for four vectors of four lanes, where separate sums would take sixteen.
+            lanes = np.arange(self.width)
+            is_second = lanes & stride != 0
+            mask_type = ir.VectorType(INT, self.width)
+            low, high = (
+                ir.Constant(mask_type, np.where(is_second, self.width + of_second, of_first).tolist())
+                for of_first, of_second in ((lanes, lanes - stride), (lanes + stride, lanes))
+            )
+            pairs = zip(values[::2], values[1::2], strict=True)
+            values = [b.fadd(b.shuffle_vector(x, y, low), b.shuffle_vector(x, y, high)) for x, y in pairs]
+            stride *= 2
+        (total,) = values
+        width = self.width
+        while width > count:
+            width //= 2
+            masks = [ir.Constant(ir.VectorType(INT, width), [*range(k, k + width)]) for k in (0, width)]
+            total = b.fadd(*(b.shuffle_vector(total, total, mask) for mask in masks))
+        return total
 
     def fold(self, value: ir.Value, combine: Callable[[ir.Value, ir.Value], ir.Value], to: int = 1) -> ir.Value:
         """Combine the halves of a vector until `to` lanes are left; one lane is a scalar."""

@@ -16,6 +16,7 @@ its end afterwards.
 import functools
 
 import jax.numpy as jnp
+from jax import Array
 from llvmlite import ir
 
 from a2tg_jax.core.geometry import Outline, ScreenBounds, clipped_box, unclipped_bounds
@@ -23,7 +24,7 @@ from a2tg_jax.rasterize.kernels.jaxprs import example, trace
 from a2tg_jax.rasterize.kernels.native import llvm_code
 from a2tg_jax.rasterize.kernels.native.lanes import Lanes
 from a2tg_jax.rasterize.kernels.native.llvm_code import INT, LONG, CompiledFunction, Writer
-from a2tg_jax.rasterize.tiles import Rectangles, TileGrid, outline_touches, tile_rectangles
+from a2tg_jax.rasterize.tiles import Rectangles, TileGrid, outline_touches, tile_edges, tile_rectangles
 
 BOUND = ("M", "cutoff", "outlines", "rectangles")
 FIND = ("order", "rectangles", "outlines", "counts", "tiles", "splats")
@@ -83,7 +84,11 @@ def _write_find(module: ir.Module, name: str, dtype: str, tile_size: int) -> Non
     b = w.b
     given = w.arguments
     number = example(dtype)
-    touches, _ = trace(functools.partial(outline_touches, tile_size=tile_size), _outline_of(dtype), number, number)
+
+    def touches_tile(outline: Outline, x0: Array, y0: Array) -> Array:
+        return outline_touches(outline, *tile_edges(x0, y0, tile_size))
+
+    touches, _ = trace(touches_tile, _outline_of(dtype), number, number)
     num_pairs = w.variable(LONG)
     b.store(LONG(0), num_pairs)
     with w.loop(LONG(0), w.long(given["num_splats"])) as (rank, _):

@@ -165,7 +165,7 @@ class _ScoreRows(_ImageRows):
                     row = b.mul(b.add(self.times(self.channels, k), channel), padded)
                     row = b.add(row, b.add(y, LONG(self.margin)))
                     self.put(slope, self.row("d_means", row, self.across), start)
-            self.store(self.lanes.sum(b.load(total, typ=self.reals)), self.arguments["sums"], index)
+            self.store(self.lanes.sums([b.load(total, typ=self.reals)])[0], self.arguments["sums"], index)
         b.ret_void()
 
     def store_columns(self, means: Sequence[ir.Value], first: ir.Value) -> None:

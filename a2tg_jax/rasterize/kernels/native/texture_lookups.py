@@ -34,7 +34,7 @@ class Place(NamedTuple):
 
     x: ir.Value  # horizontal coordinates in texels
     y: ir.Value  # vertical coordinates in texels
-    is_reached: ir.Value  # mask of the lanes whose pixel the splat may reach; at least one is set
+    is_reached: ir.Value  # mask of the lanes whose pixel the splat may reach
 
 
 class Line(NamedTuple):
@@ -217,15 +217,12 @@ class TexelWriter(Writer):
     def add_sums(self, entry: ir.Value, vectors: Sequence[ir.Value]) -> None:
         """Add the sums over lanes of C vectors to a texel."""
         b = self.b
-        if len(vectors) == 4 and self.lanes.width % 4 == 0:
-            # A transposition of 4×4 lanes and L/4 − 1 additions, where four separate sums would take 4·log L steps.
-            total = functools.reduce(b.fadd, self.transpose_quarters(vectors))
-            sums = self.lanes.fold(total, b.fadd, 4)
-        else:
-            sums = ir.Constant(ir.VectorType(self.real, len(vectors)), ir.Undefined)
-            for k, vector in enumerate(vectors):
-                sums = b.insert_element(sums, self.lanes.sum(vector), INT(k))
-        self.store(self.b.fadd(self.load(entry, 0, sums.type), sums), entry, 0)
+        for first in range(0, len(vectors), self.lanes.width):
+            some = vectors[first : first + self.lanes.width]
+            sums = self.lanes.sums_in_lanes(some)
+            sums = b.shuffle_vector(sums, sums, ir.Constant(ir.VectorType(INT, len(some)), [*range(len(some))]))
+            base = self.at(entry, LONG(first), self.real)
+            self.store(b.fadd(self.load(base, 0, sums.type), sums), base, 0)
 
     def accumulate(self, totals: Sequence[ir.Value], weight: ir.Value | None, numbers: Sequence[ir.Value]) -> None:
         """Add weight·numbers to the totals; a weight of None is zero."""
@@ -244,24 +241,3 @@ class TexelWriter(Writer):
 
     def loads(self, slots: Sequence[ir.Value]) -> list[ir.Value]:
         return [self.b.load(slot, typ=self.reals) for slot in slots]
-
-    def transpose_quarters(self, vectors: Sequence[ir.Value]) -> list[ir.Value]:
-        """Transpose every four lanes of four vectors as a 4×4 matrix: in pairs, then in pairs of pairs."""
-        a, b, c, d = vectors
-        low = (0, "0", 1, "1")
-        high = (2, "2", 3, "3")
-        low_ab = self.shuffle(a, b, low)
-        low_cd = self.shuffle(c, d, low)
-        high_ab = self.shuffle(a, b, high)
-        high_cd = self.shuffle(c, d, high)
-        first = (0, 1, "0", "1")
-        second = (2, 3, "2", "3")
-        pairs = (low_ab, low_cd, first), (low_ab, low_cd, second), (high_ab, high_cd, first), (high_ab, high_cd, second)
-        return [self.shuffle(*pair) for pair in pairs]
-
-    def shuffle(self, x: ir.Value, y: ir.Value, pattern: Sequence[int | str]) -> ir.Value:
-        """Apply a pattern to every four lanes; numbers are lanes of x, strings are lanes of y."""
-        width = self.lanes.width
-        lanes = [width + int(lane) if isinstance(lane, str) else lane for lane in pattern]
-        mask = [quarter + lane for quarter in range(0, width, 4) for lane in lanes]
-        return self.b.shuffle_vector(x, y, ir.Constant(ir.VectorType(INT, width), mask))
