@@ -410,7 +410,7 @@ CALLS = {
     "plan_render(CAMERA, GAUSSIANS)": "gaussians … Model or Gaussians … Camera",
     "plan_render(GAUSSIANS, None)": "cameras … Camera or an Iterable … NoneType",
     "plan_render(GAUSSIANS, [VIEW])": "cameras[0] … Camera … View … view.camera",
-    "plan_render(MODEL, [CAMERA], appearance=MODEL.appearance)": "plan_render(model, cameras)",
+    "plan_render(MODEL, [CAMERA], appearance=MODEL.appearance)": "appearance … a model has its own … the model alone",
     "Renderer(FLAT_SH)": "gaussians.sh … [7, K, 3] … K = 2",
     "Renderer(GAUSSIANS, CAMERA)": "appearance … Appearance … Camera",
     "render_image(changed(means=np.zeros((7, 3))), CAMERA)": "gaussians.means must be float32 as quats, log_scales, "
