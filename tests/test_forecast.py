@@ -248,7 +248,8 @@ def test_on_an_accelerator_its_own_memory_counts(monkeypatch):
             return {"bytes_limit": 6 * 10**9}
 
     scene, system = scene_of(600, 400), a2tg.Gaussians2dMcmc()
-    monkeypatch.setattr(memory, "default_device", Device)
+    for module in (machine, memory):
+        monkeypatch.setattr(module, "default_device", Device)
     found = run_of(scene, system)
     assert allowed_memory(None) == 6e9 and allowed_memory(5e9) == 5e9
     assert found.peak[1].program == 0

@@ -785,7 +785,9 @@ def test_a_matrix_product_in_shade_is_composited_by_xla(monkeypatch):
     printed_text = r"the primitive '(stack|broadcast_in_dim)' in Mixed\.shade"
     with pytest.warns(UserWarning, match=rf"Mixed is composited by XLA, which is slower: .*{printed_text}"):
         found = drawn(MIXED, "auto")
-    np.testing.assert_allclose(found, drawn(MIXED_BY_HAND, "auto"), atol=1e-5)
+    by_hand = np.asarray(drawn(MIXED_BY_HAND, "auto"))
+    # XLA and the native loops round places on splats differently, where colours rise to 10.
+    np.testing.assert_allclose(found, by_hand, rtol=0, atol=3e-6 * np.abs(by_hand).max())
     monkeypatch.setitem(platforms.PLATFORMS, "cuda", "cpu")
     monkeypatch.setattr("a2tg_jax.rasterize.kernels.cuda.nvrtc.find", lambda: True)
     for name in ("native", "cuda"):

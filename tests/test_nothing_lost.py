@@ -256,7 +256,9 @@ def test_a_replacement_that_was_stopped_keeps_the_old_run_and_continues(tmp_path
     with monkeypatch.context() as patch:
         patch.setattr(stage_training, "save_checkpoint", saving_until(4))
         assert cli.main([*TRAIN, "--seed", "5", "--out", str(run.path), "--overwrite"]) == 130
-    assert f"{NAME}-0000000004.npz; continue with: a2tg train --out {run.path} --resume" in capsys.readouterr().err
+    printed = capsys.readouterr().err
+    assert f"{NAME}-0000000004.npz; " in printed
+    assert f"; continue with: a2tg train --out {run.path} --resume" in printed
     kept = old_run(run)
     assert kept is not None and kept.report.read_text() == "old report.html" and read_record(kept) == RECORD
     assert cli.main(["info", str(run.path)]) == 0

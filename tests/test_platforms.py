@@ -69,7 +69,7 @@ def test_xla_takes_more_tiles_at_once_elsewhere(compositor):
     """15 tiles one by one on CPUs, else all together."""
 
     def total(gaussians):
-        return jnp.sum(image(gaussians, compositor=compositor))
+        return jnp.sum(image(gaussians, compositor=compositor, tile_size=8))
 
     many = [len(re.findall("tensor<15x[0-9x]*64xf32>", lowered(name, total))) for name in ("cpu", "cuda")]
     assert many[0] < many[1]

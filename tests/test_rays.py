@@ -160,7 +160,7 @@ def test_pixels_without_a_ray_see_the_background(x64):
     blind = dataclasses.replace(camera, rays=jnp.where(hidden[..., None], jnp.nan, camera.rays))
     gaussians = as_gaussians(scene, "float64")
     textures = as_textures(scene, "float64")
-    settings = a2tg.RenderSettings(capacity=CAPACITY)
+    settings = a2tg.RenderSettings(capacity=CAPACITY, tile_size=8)  # The first hidden pixels are a whole tile.
 
     @jax.jit
     def seen(means, camera):

@@ -238,7 +238,8 @@ def test_an_event_stays_within_its_budget_and_spends_it(budget_mb):
     state = event.observe(event.init(base), base, seen)
     after = event.apply(Due(), base, adam_init(partition(base)[0]), state).model
     assert 1e6 * budget_mb - 36 < after.num_bytes <= 1e6 * budget_mb
-    np.testing.assert_allclose(after.render(camera).color, base.render(camera).color, atol=1e-6)
+    # Two programs, which round sums of float32 differently.
+    np.testing.assert_allclose(after.render(camera).color, base.render(camera).color, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("base, highest, num_bytes", [(0, 2, 5_000), (1, 3, 900), (0, 3, 100_000)])
