@@ -13,7 +13,7 @@ from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.minutes import Speed, TimedTraining, measured_speed, training_within
 from a2tg_jax.results.record import read_record
 
-SPEED = Speed(pixel_seconds=4e-7, compile_seconds=30)
+SPEED = Speed(pixel_seconds=4e-7, other_seconds=30)
 """About two cores of a laptop."""
 
 
@@ -48,7 +48,7 @@ def test_too_few_minutes_are_refused_with_the_number_that_is_needed():
 
 def test_the_speed_is_of_a_gradient():
     speed = measured_speed(a2tg.synthetic_scene(num_views=4, width=32, height=24))
-    assert 1e-9 < speed.pixel_seconds < 1e-2 and speed.compile_seconds > 0.1
+    assert 1e-9 < speed.pixel_seconds < 1e-2 and speed.other_seconds > 0.1
 
 
 def write_scene(folder):

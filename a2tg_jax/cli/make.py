@@ -16,7 +16,7 @@ from a2tg_jax.cli.main import parsed
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.output_paths import check_apart, check_output
 
-NUM_FRAMES = 90
+NUM_FRAMES = 60
 """Number of frames of the turntable."""
 
 

@@ -129,7 +129,7 @@ def write_png(path: str | os.PathLike[str], picture: Image.Image | np.ndarray) -
     picture = Image.fromarray(picture) if isinstance(picture, np.ndarray) else picture
     text = PngInfo()
     text.add_text("Software", PROGRAM)  # `data.photo_folder` takes no such picture for a photograph.
-    picture.save(path, format="PNG", optimize=True, pnginfo=text)
+    picture.save(path, format="PNG", pnginfo=text)
 
 
 def jpeg_uri(image: np.ndarray, *, zoom: int = 1, quality: int = 88) -> str:

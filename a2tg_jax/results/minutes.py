@@ -28,13 +28,14 @@ LEAST_ITERATIONS = 1_000
 MOST_ITERATIONS = 30_000
 NUM_TIMED = 5
 """Number of timed gradients; the median counts."""
-STEP = 2.0
+STEP = 2.8
 """Time of a training step of `bytewise`, its events included, as a multiple of the time of a gradient of the initial
-Gaussians: 1.3 to 2.1 on three captures."""
-COMPILING = 9.0
-"""Time in which a training compiles, as a multiple of the time in which this gradient does."""
-OTHER_SHARE = 0.15
-"""Share of the time for evaluation, page and turntable."""
+Gaussians, on two cores."""
+OVERHEAD = 25.0
+"""Time in which a training compiles, is evaluated, and gets its page and turntable, as a multiple of the time in which
+this gradient compiles."""
+OTHER_SHARE = 0.1
+"""Share of the time that is kept in reserve."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,8 +44,8 @@ class Speed:
 
     pixel_seconds: float
     """Time of a training step for each pixel of a photograph, in seconds."""
-    compile_seconds: float
-    """Time in which a training compiles, in seconds."""
+    other_seconds: float
+    """Time of everything but steps, in seconds."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,7 +111,7 @@ def training_within(seconds: float, speed: Speed, size: tuple[int, int], downsca
       ValueError: if the time is too short for a useful training.
     """
     full = size[0] * downscale, size[1] * downscale
-    available = (1 - OTHER_SHARE) * seconds - speed.compile_seconds
+    available = (1 - OTHER_SHARE) * seconds - speed.other_seconds
     # iterations = ITERATIONS √(pixels / PIXELS), and iterations · pixels · pixel_seconds = available.
     rate = ITERATIONS / math.sqrt(PIXELS) * speed.pixel_seconds
     pixels = (max(available, 0) / rate) ** (2 / 3)
@@ -121,12 +122,12 @@ def training_within(seconds: float, speed: Speed, size: tuple[int, int], downsca
     step = speed.pixel_seconds * width * height
     iterations = min(int(available / step), MOST_ITERATIONS)
     if iterations < LEAST_ITERATIONS:
-        least = (LEAST_ITERATIONS * step + speed.compile_seconds) / (1 - OTHER_SHARE)
+        least = (LEAST_ITERATIONS * step + speed.other_seconds) / (1 - OTHER_SHARE)
         raise ValueError(
             f"minutes are too few: {max(seconds, 0) / 60:.1f} are left to train, and this machine needs "
             f"{math.ceil(least / 6) / 10} at least, as busy as now"
         )
-    expected = iterations * step + speed.compile_seconds + OTHER_SHARE * seconds
+    expected = iterations * step + speed.other_seconds + OTHER_SHARE * seconds
     budget = round(BYTES_PER_PIXEL * width * height / 1e6, 2)
     return TimedTraining(chosen, width, height, iterations, max(budget, 0.1), expected)
 
@@ -150,7 +151,7 @@ def measured_speed(scene: Scene) -> Speed:
         jax.block_until_ready(gradient(gaussians, view.camera, photograph))
         times.append(time.perf_counter() - started)
     pixel_seconds = STEP * float(np.median(times[1:])) / (width * height)
-    return Speed(pixel_seconds, COMPILING * times[0])
+    return Speed(pixel_seconds, OVERHEAD * times[0])
 
 
 def _size(scene: Scene) -> tuple[int, int]:
