@@ -87,3 +87,15 @@ def test_a_scene_becomes_a_page_by_printed_commands_and_the_same_command_continu
     monkeypatch.setattr("a2tg_jax.results.minutes.choose_training", None)
     assert cli.main(words) == 0
     assert re.findall(r"^\$ a2tg (\w+)", capsys.readouterr().out, flags=re.MULTILINE) == ["export", "render"]
+
+
+def test_files_of_another_origin_are_not_replaced(tmp_path, capsys):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos.html").write_text("mine")
+    assert cli.main(["make", str(tmp_path / "photos"), "--out", str(tmp_path)]) == 2
+    capsys.readouterr()
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "photos.html").write_text("mine")
+    assert cli.main(["make", str(tmp_path / "photos"), "--out", str(tmp_path / "out")]) == 2
+    assert "photos.html exists, and was made from no run" in capsys.readouterr().err
+    assert (tmp_path / "out" / "photos.html").read_text() == "mine"

@@ -61,25 +61,32 @@ class Make:
         check_output(out)
         out.mkdir(parents=True, exist_ok=True)
 
-        has_cameras = len(self.sources) == 1 and is_scene(first)
-        scene = first if has_cameras else out / "scene"
-        if not is_scene(scene):
-            run_step("sfm", [*map(str, self.sources), "--out", str(scene)])
         run = RunFolder(out / "run")
-        if not is_regular(run.record):
+        page = out / f"{name}.html"
+        picture = out / f"{name}.png"
+        turntable = out / "turntable"
+        is_new = not is_regular(run.record)
+        for path in (page, picture, turntable):
+            if is_new and path.exists():
+                raise FileExistsError(f"{path} exists, and was made from no run in {out}: choose another `out`")
+        scene = first
+        if len(self.sources) > 1 or not is_scene(first):
+            scene = out / "scene"
+            if not is_scene(scene):
+                run_step("sfm", [*map(str, self.sources), "--out", str(scene)])
+        if is_new:
             left = 60 * self.minutes - (time.monotonic() - started)
             training = choose_training(scene, left)
             print_now(training.text)
             run_step("train", [str(scene), "--out", str(run.path), *training.flags, "--yes"])
         elif not is_finished(run, read_record(run)):
             run_step("train", ["--out", str(run.path), "--resume"])
+        else:
+            print_now(f"{run.path} is trained already; for another training, give another --out")
 
-        page = out / f"{name}.html"
         run_step("export", [str(run.path), "--web", str(page), "--title", name, "--overwrite"])
-        turntable = out / "turntable"
         flight = ["--path", "orbit", "--frames", str(NUM_FRAMES), "--out", str(turntable), "--overwrite"]
         run_step("render", [str(run.path), *flight])
-        picture = out / f"{name}.png"
         shutil.copyfile(min(turntable.glob("*.png")), picture)
         minutes, seconds = divmod(round(time.monotonic() - started), 60)
         print_now(f"made in {minutes}:{seconds:02} minutes\npage: {page}\npicture: {picture}\nturntable: {turntable}/")

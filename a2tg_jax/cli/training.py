@@ -1,4 +1,4 @@
-"""What `a2tg train` and `a2tg demo` share: questions, devices, a page in the browser, results."""
+"""Shared by `a2tg train` and `a2tg demo`: questions, devices, a page in the browser, results."""
 
 import sys
 from collections.abc import Callable, Sequence

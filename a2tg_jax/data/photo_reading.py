@@ -61,7 +61,7 @@ ROUNDING = 1.0
 
 @dataclasses.dataclass(frozen=True)
 class SceneOptions:
-    """Where a scene is and how its photographs are read."""
+    """Path of a scene, and options for reading its photographs."""
 
     path: str = ""
     """Scene folder with photographs and cameras, or a built-in scene, "synthetic" or "cells"; not needed with --config

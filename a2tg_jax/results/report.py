@@ -87,7 +87,7 @@ class RunResult:
     is_lpips_kept: bool = False
     """Whether LPIPS is from an earlier measurement of the same models."""
     note: str = ""
-    """What the main model is, if the main system is not finished (`model_source.chosen_stage`)."""
+    """Note on the main model if the main system is not finished (`model_source.chosen_stage`)."""
 
     @property
     def main(self) -> str:

@@ -74,7 +74,7 @@ class StepSettings:
 
 
 class StepInputs(NamedTuple):
-    """What a step reads besides the state; traced."""
+    """Inputs of a step besides the state, traced."""
 
     stage: Stage
     clock: Clock

@@ -150,7 +150,7 @@ class _Pass(TexelWriter):
         past = np.full((self.num_blocks + 1) * width - len(order), 1e9)
         self.transmittance = self.variable(self.block_reals, self.num_blocks + 1)
         self.live = self.variable(self.block_integers, self.num_blocks + 1)
-        # Bit k of word w stands for block w·WORD + k. R blocks are found at once.
+        # Bit k of word w marks block w·WORD + k. R blocks are found at once.
         self.num_words = -(-self.num_blocks // WORD)
         self.finds_per_word = min(WORD // width, -(-self.num_blocks // width))
         self.live_words = self.variable(LONG, self.num_words)
