@@ -426,7 +426,8 @@ def test_an_interrupted_run_says_how_to_continue(run, tmp_path, monkeypatch, cap
         assert cli.main(words) == 130
         error = capsys.readouterr().err
         shows = f"show it with: a2tg view {copy.path} --model a2tg-textures"
-        assert f"a2tg-textures.npz; {shows}; continue with: a2tg train --out {copy.path} --resume" in error
+        continues = f"continue with: a2tg train --out {copy.path} --resume (add --finish-now to finish soon)"
+        assert f"a2tg-textures.npz; {shows}; {continues}" in error
 
 
 def test_run_folder_is_complete(run):

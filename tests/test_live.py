@@ -49,7 +49,7 @@ def stage_run():
     stage = SimpleNamespace(name="textures", iterations=30)
     history = with_row(History.empty(), 1, 20, 0.5, 17.0, 40, 1.25, 3.0)
     left = datetime.timedelta(seconds=70)
-    return SimpleNamespace(state=state, stage=stage, history=history, system=SYSTEM, time_left=left)
+    return SimpleNamespace(state=state, stage=stage, history=history, system=SYSTEM, time_left=left, session=Session())
 
 
 def encoded(live: LiveView) -> None:
@@ -118,6 +118,11 @@ def test_pause_holds_the_training_until_it_is_resumed_or_stopped():
     assert 0.2 < held <= time.perf_counter() - began and not status(live)["is_paused"]
     assert post("/pause", **own).startswith("200")
     assert live(run, lambda: True) < 0.2
+    assert not run.session.is_shortened
+    assert post("/finish", **own).startswith("200")
+    assert status(live)["is_finishing"] and not status(live)["is_paused"]
+    live(run, lambda: False)
+    assert run.session.is_shortened
 
 
 def test_systems_that_cannot_be_shown_are_reported():

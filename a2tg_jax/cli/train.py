@@ -36,6 +36,7 @@ FLAGS[RunRecord] = {
     "init": (arg(metavar="FILE"),),
     "file_budget": (arg(metavar="SIZE"),),
     "compare_options": (Fixed, Suppress),
+    "shortened_at": (Fixed, Suppress),
 }
 BASELINE = "gaussians-2d-mcmc"
 HEARTBEAT_TIMEOUT = 60.0
@@ -59,6 +60,9 @@ class Train:
     """Compare with plain Gaussians, gaussians-2d-mcmc. With --memory-budget both get the same bytes."""
     resume: bool = False
     """Continue from the newest checkpoint in the run folder."""
+    finish_now: bool = False
+    """With --resume, finish soon: what is left of each stage is done in a tenth of the steps, at least 100. Schedules
+    reach their end, so that budgets are kept."""
     overwrite: bool = False
     """Replace an earlier run in that folder; it is kept until the new one has its report."""
     lpips_weights: LpipsWeights = None
@@ -98,11 +102,14 @@ class Train:
         from a2tg_jax.results.run_processes import check_batch_sizes, follow_first_process
         from a2tg_jax.results.run_training import RunOptions, begin_run, unseen, warn
 
+        if self.finish_now and not self.resume:
+            raise ValueError("--finish-now shortens a training that was stopped: add --resume")
         if not self.record.scene.path:
             raise ValueError(SCENE_IS_MISSING)
         # Processes must join before anything starts the devices of JAX.
         with joined(self.place, lambda: f"continue with: {resuming_command(RunFolder(self.out))}"):
             session = Session(after_compiling=tidy_memory, devices=training.devices_named(self.devices))
+            session.is_shortened = self.finish_now
             most = budget_in_bytes(self.max_memory, "max_memory")
             record = self.whole_record
             if not self.resume:

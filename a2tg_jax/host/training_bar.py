@@ -46,17 +46,17 @@ class ProgressBar(Display):
         self._bar.write(f"{self._title}: {text}")
 
     def update(
-        self, loss: float, psnr: float, row: Mapping[str, float] | None, left: datetime.timedelta | None
+        self, done: int, loss: float, psnr: float, row: Mapping[str, float] | None, left: datetime.timedelta | None
     ) -> None:
-        """Count one iteration; loss and PSNR are shown as running means."""
+        """Show the iterations that are done; loss and PSNR are shown as running means."""
         if self._loss is None:
             self._loss = loss
             self._psnr = psnr
             self._bar.set_description_str(self._title)
         self._loss += (1 - MOMENTUM) * (loss - self._loss)
         self._psnr += (1 - MOMENTUM) * (psnr - self._psnr)
-        self._done += 1
-        self._bar.update()
+        self._bar.update(done - self._done)
+        self._done = done
         if row and not self._bar.disable:
             self._bar.set_postfix_str(self._figures(row, left), refresh=False)
         if self._is_plain and is_line_due(self._done, self._total, *self._last_line):

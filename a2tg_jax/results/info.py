@@ -105,7 +105,12 @@ def run_facts(run: RunFolder) -> dict[str, Any]:
     except ValueError as error:
         damage = str(error)
     plan = record.plan
-    stages = [{"name": name, **_stage_facts(run, plan[name]), "psnr": psnrs.get(name)} for name in plan.names]
+    stages = []
+    for name in plan.names:
+        facts = {"name": name, **_stage_facts(run, plan[name]), "psnr": psnrs.get(name)}
+        if name in record.shortened_at:
+            facts["shortened_at"] = record.shortened_at[name]
+        stages.append(facts)
     return {
         "path": str(run.path),
         "scene": record.scene.path,
@@ -196,13 +201,17 @@ def _stage_text(stage: Mapping[str, Any]) -> str:
     match stage["state"]:
         case "in training":
             counts = f"; {_counts_text(stage)}" if "num_gaussians" in stage else "; its checkpoint is damaged"
-            return f"after iteration {stage['iteration']:,} of {stage['iterations']:,}{counts}"
+            return f"after iteration {stage['iteration']:,} of {stage['iterations']:,}{counts}{_shortened(stage)}"
         case "damaged":
             return f"damaged: {stage['damage']}; delete it, and a2tg train --resume trains the stage again"
         case "finished":
             psnrs = [f"{split} {psnr:.2f} dB" for split, psnr in (stage["psnr"] or {}).items()]
-            return "; ".join([_counts_text(stage), *psnrs])
+            return "; ".join([_counts_text(stage), *psnrs]) + _shortened(stage)
     return str(stage["state"])
+
+
+def _shortened(stage: Mapping[str, Any]) -> str:
+    return f"; finished early, from iteration {stage['shortened_at']:,}" if "shortened_at" in stage else ""
 
 
 def _counts_text(facts: Mapping[str, Any]) -> str:

@@ -14,6 +14,9 @@ It is kept as run.toml. A configuration file has the same keys; missing ones hav
     [compare_options.gaussians-2d-mcmc]  # options of a compared system, instead of the main one's
     sh_degree = 0
 
+    [shortened_at]                       # iterations from which stages are shortened, because you finished them early
+    gaussians = 1200
+
 In a file with `version`, as a run's has, missing options are as in the preset "paper": it has all of its version's.
 """
 
@@ -76,6 +79,9 @@ class RunRecord:
     """Options of the compared systems, nested, by name. Missing ones take the main system's values, or the preset's if
     it lacks them. run.toml keeps all those that the main system lacks."""
 
+    shortened_at: Mapping[str, int] = dataclasses.field(default_factory=dict, compare=False)
+    """Iterations from which stages are shortened (`Session.is_shortened`), by the stage's name; run.toml keeps them."""
+
     def __post_init__(self) -> None:
         """Convert the file budget to a number of MB."""
         object.__setattr__(self, "file_budget", megabytes_of(self.file_budget, "file_budget"))
@@ -116,6 +122,12 @@ class RunRecord:
             check_encodable(self.options.stages()[-1].appearance, "the file of file_budget", "leave it out")
         if self.init is not None and len(self.plan.main) < 2:
             raise ValueError(f"init replaces a first stage, and {self.system} has no second one")
+        for name, iteration in self.shortened_at.items():
+            if name not in self.plan.names or not 0 <= iteration <= self.plan[name].stage.iterations:
+                raise ValueError(
+                    f"shortened_at.{shortened(name)} must be an iteration of a stage of the run "
+                    f"({', '.join(self.plan.names)}); got {iteration}: remove it to train the stage as planned"
+                )
 
     @property
     def file_bytes(self) -> int | None:
@@ -132,6 +144,12 @@ class RunRecord:
         """Return the record without the memory budget that `budgeted` adds."""
         plain = self.with_options(memory_budget=None)
         return plain if plain.budgeted() == self else self
+
+    def shortened_from(self, name: str, iteration: int) -> "RunRecord":
+        """Return the record in which a stage is shortened from an iteration on, and all later ones from their start."""
+        names = self.plan.names
+        later = dict.fromkeys(names[names.index(name) + 1 :], 0)
+        return dataclasses.replace(self, shortened_at={**self.shortened_at, name: iteration, **later})
 
     def with_options(self, **changes: Any) -> "RunRecord":
         """Return the record with some options changed."""
@@ -258,6 +276,8 @@ def write_record(run: RunFolder, record: RunRecord) -> None:
         compared[name] = _without_none(kept, config_to_dict(compared_system(name, record.options)))
     if compared:
         table["compare_options"] = compared
+    if record.shortened_at:
+        table["shortened_at"] = dict(record.shortened_at)
     text = f"# Repeats the run: {repeating_command(run)}\n"
     caps = record.options.caps()
     if caps and record.options.memory_budget is not None:

@@ -362,7 +362,9 @@ def write_report(
     titles, rows = summary_table(result, names)
     seconds = {name: model.seconds for name, model in result.models.items()}
     main_seconds = sum(seconds[name] for name in result.plan.main if name in seconds)
-    leaves = flatten_config(result.record.scene, "scene.") | flatten_config(result.record.options)
+    record = result.record
+    leaves = flatten_config(record.scene, "scene.") | flatten_config(record.options)
+    leaves |= {f"shortened_at.{name}": iteration for name, iteration in record.shortened_at.items()}
     page = pages.get_template("report.html").render(
         **inlined,
         policy=Markup(policy),

@@ -67,11 +67,17 @@ def _checksum(x: Any) -> tuple[tuple[int, ...], int]:
     return np.shape(x), zlib.crc32(np.ascontiguousarray(x).tobytes())
 
 
-def send_stage(name: str | None, files: Sequence[Path | None] = (), num_restored: int | None = None) -> None:
-    """Send the other processes the name of the next stage, with the checkpoint and the model that it starts from; None
-    at the end."""
+def send_stage(
+    name: str | None,
+    files: Sequence[Path | None] = (),
+    num_restored: int | None = None,
+    shortened_at: int | None = None,
+) -> None:
+    """Send the other processes the name of the next stage, with the checkpoint and the model that it starts from, and
+    arguments of `fit_stage`; None at the end."""
     if jax.process_count() > 1:
-        broadcast(json.dumps({"name": name, "num_restored": num_restored}).encode())
+        header = {"name": name, "num_restored": num_restored, "shortened_at": shortened_at}
+        broadcast(json.dumps(header).encode())
         for file in files:
             broadcast(b"" if file is None else file.read_bytes())
 
@@ -112,6 +118,7 @@ def follow_first_process(record: RunRecord, scene: Scene, session: Session) -> N
                     checkpoint_every=planned.checkpoint_every,
                     is_stopped=is_stopped,
                     num_restored=header["num_restored"],
+                    shortened_at=header["shortened_at"],
                     session=session,
                 )
 

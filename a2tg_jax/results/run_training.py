@@ -176,14 +176,14 @@ def _advice(run: RunFolder, options: RunOptions) -> str:
 
 def how_to_go_on(run: RunFolder, devices: Devices | None = None) -> str:
     """Return the newest file of the training and the command that shows it, and the command that resumes, as
-    `resuming_command`."""
+    `resuming_command`, with the flag that finishes soon."""
     kept = "there is no checkpoint yet"
     for name in read_record(run).plan.names:
         path = run.newest(name)
         if path is not None:
             what = "model" if path == run.model(name) else "checkpoint"
             kept = f"the last {what} is {path}; show it with: {viewing_command(run, name)}"
-    return f"{kept}; continue with: {resuming_command(run, devices)}"
+    return f"{kept}; continue with: {resuming_command(run, devices)} (add --finish-now to finish soon)"
 
 
 def _write_file(run: RunFolder, record: RunRecord, max_bytes: int, scene: Scene, options: RunOptions) -> None:
@@ -235,7 +235,7 @@ def train_run(
             events = EventWriter(run, name) if options.tensorboard else None
             bar = Progress(ProgressBar if options.progress else None, name, after[name])
             fit_this = functools.partial(fit, progress=bar, checkpoint_every=planned.checkpoint_every)
-            result = _train_stage(run, planned, scene, fit_this, events, record.on_nan)
+            result = _train_stage(run, planned, scene, fit_this, events)
             if events is not None:
                 events.add(result.history)
                 events.close()
@@ -256,7 +256,6 @@ def _train_stage(
     scene: Scene,
     fit: Callable[..., StageResult],
     events: EventWriter | None,
-    on_nan: OnNan,
 ) -> StageResult:
     """Train a stage as `train_stage`; after a divergence, restore it if allowed."""
 
@@ -264,16 +263,30 @@ def _train_stage(
         if events is not None:
             events.skip(checkpoint.history)
 
+    record = read_record(run)
+
     def add(checkpoint: Checkpoint) -> None:
         if events is not None:
             events.add(checkpoint.history)
+        # At once, so that a run that is killed repeats it.
+        if checkpoint.shortened_at is not None and planned.name not in record.shortened_at:
+            write_record(run, record.shortened_from(planned.name, checkpoint.shortened_at))
 
     num_restored = None
     while True:
         try:
-            return train_stage(run, planned, scene, fit, num_restored=num_restored, on_resume=skip, on_checkpoint=add)
+            return train_stage(
+                run,
+                planned,
+                scene,
+                fit,
+                num_restored=num_restored,
+                shortened_at=record.shortened_at.get(planned.name),
+                on_resume=skip,
+                on_checkpoint=add,
+            )
         except DivergedError as error:
-            num_restored = _restored(run, planned.name, error, on_nan)
+            num_restored = _restored(run, planned.name, error, record.on_nan)
 
 
 def _restored(run: RunFolder, name: str, error: DivergedError, on_nan: OnNan) -> int:

@@ -27,6 +27,7 @@ def train_stage(
     fit: Callable[..., StageResult],
     *,
     num_restored: int | None = None,
+    shortened_at: int | None = None,
     on_resume: OnCheckpoint = lambda checkpoint: None,
     on_checkpoint: OnCheckpoint = lambda checkpoint: None,
 ) -> StageResult:
@@ -38,8 +39,9 @@ def train_stage(
       scene: the scene.
       fit: `fit_stage` with its scene and options, except those that this function decides.
       num_restored: as in `fit_stage`.
+      shortened_at: as in `fit_stage`.
       on_resume: called with the newest checkpoint of the stage, if there is one.
-      on_checkpoint: called with each checkpoint before it is written.
+      on_checkpoint: called with each checkpoint before it is written; one of iteration 0 is not.
 
     Raises:
       ValueError: as `fit_stage` does, or if a checkpoint or model is damaged, of another version, or made with other
@@ -48,9 +50,9 @@ def train_stage(
     """
 
     def keep(checkpoint: Checkpoint) -> None:
+        on_checkpoint(checkpoint)
         if checkpoint.iteration == 0:
             return  # The stage's start gives the same state.
-        on_checkpoint(checkpoint)
         save_checkpoint(files.own(files.checkpoint(planned.name, checkpoint.iteration)), checkpoint)
         files.drop_old_checkpoints(planned.name)
 
@@ -72,7 +74,7 @@ def train_stage(
         # Its system may have other options for later stages.
         resume = dataclasses.replace(resume, system=planned.system)
     # Files, not arrays: other processes read them exactly as this one did.
-    send_stage(planned.name, [resume_file, start_file], num_restored)
+    send_stage(planned.name, [resume_file, start_file], num_restored, shortened_at)
     return fit(
         planned.system,
         planned.index,
@@ -80,6 +82,7 @@ def train_stage(
         resume=resume,
         on_checkpoint=keep,
         num_restored=num_restored,
+        shortened_at=shortened_at,
     )
 
 

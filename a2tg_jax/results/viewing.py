@@ -108,13 +108,17 @@ class LiveView:
         """Time of the next snapshot; infinite while one is made."""
         self._noted = -math.inf
         self._paused = threading.Event()
+        self._is_finishing = threading.Event()
         self._lock = threading.Lock()
         self._encoder: threading.Thread | None = None
         self._scene_bytes: bytes | None = None
         self._status: dict[str, Any] = {"version": 0, "message": "", "stage": ""}
 
     def __call__(self, run: StageRun, is_stopped: Callable[[], bool]) -> float:
-        """Record metrics, take a snapshot when one is due, and wait while the training is paused."""
+        """Record metrics, take a snapshot when one is due, and wait while the training is paused. Shorten the training
+        once you have asked for it."""
+        if self._is_finishing.is_set():
+            run.session.is_shortened = True
         if self._now() >= self._noted + NOTED_SECONDS:
             self._note(run)
         # One snapshot at a time; a paused training is shown as it is now.
@@ -147,12 +151,18 @@ class LiveView:
             f"/{STATUS_NAME}": Route("application/json", self._status_json),
             "/pause": Route("application/json", self._status_json, act=self._paused.set),
             "/resume": Route("application/json", self._status_json, act=self._paused.clear),
+            "/finish": Route("application/json", self._status_json, act=self._finish),
             **CameraPhotographs(self._scene.origin, lambda: self._scene).routes,
         }
 
     def _status_json(self) -> bytes:
         with self._lock:
-            return json.dumps(self._status | {"is_paused": self._paused.is_set()}).encode()
+            flags = {"is_paused": self._paused.is_set(), "is_finishing": self._is_finishing.is_set()}
+            return json.dumps(self._status | flags).encode()
+
+    def _finish(self) -> None:
+        self._is_finishing.set()
+        self._paused.clear()
 
     def _note(self, run: StageRun) -> None:
         self._noted = self._now()

@@ -57,6 +57,8 @@ class Checkpoint(NamedFields):
     """Number of Gaussians so far that were not added for lack of room."""
     views: RecordedViews | None = None
     """The training views, with checksums of their photographs; None if they are unknown."""
+    shortened_at: int | None = None
+    """Iteration from which the stage is shortened (`Session.is_shortened`); None: it is not."""
 
     @property
     def iteration(self) -> int:
@@ -118,6 +120,7 @@ def save_checkpoint(path: str | os.PathLike[str], checkpoint: Checkpoint) -> Non
         "stage": checkpoint.stage,
         "is_ahead": [event is not None for event in state.events],
         "num_restored": checkpoint.num_restored,
+        "shortened_at": checkpoint.shortened_at,
         "machine": config_to_dict(this_machine()),
         "devices": config_to_dict(checkpoint.devices),
         "num_refused": checkpoint.num_refused,
@@ -197,7 +200,13 @@ def _checkpoint_of(header: dict[str, Any], arrays: dict[str, np.ndarray], system
     views = None
     if header.get("views") is not None:  # Checkpoints of earlier versions do not record them.
         views = RecordedViews.of_arrays(header["views"], arrays_below(VIEWS, arrays))
-    return Checkpoint(system, index, state, history, machine=machine, devices=devices, views=views, **counts)
+    shortened_at = header.get("shortened_at")  # Checkpoints of earlier versions do not record it.
+    if shortened_at is not None:
+        check_count("shortened_at", shortened_at, stage.iterations)
+    return Checkpoint(
+        system, index, state, history, machine=machine, devices=devices, views=views, shortened_at=shortened_at,
+        **counts,
+    )  # fmt: skip
 
 
 LONGEST_DIFFERENCE = 300

@@ -191,9 +191,14 @@ def fit(
     for stage in stages[first:]:
         stage.check_views(scene.train)
     results: list[StageResult] = []
+    is_shortened = resume is not None and resume.shortened_at is not None
     for index in range(first, len(stages)):
         after = RestOfRun(model_bytes=max(model_bytes[index + 1 :], default=0))
-        run = StageRun(scene, system, index, begin, None, session, max_memory, Progress(progress, after=after))
+        run = StageRun(
+            scene, system, index, begin, None, session, max_memory, Progress(progress, after=after),
+            # The stages after a shortened one are shortened as well.
+            shortened_at=0 if is_shortened and index > first else None,
+        )  # fmt: skip
         run.train(on_checkpoint, checkpoint_every, on_log, is_stopped)
         is_last = index == len(stages) - 1
         results.append(_result_of(run, scene, is_last=is_last))
@@ -270,6 +275,7 @@ def fit_stage(
     is_stopped: IsStopped = never,
     session: Session | None = None,
     max_memory: int | None = None,
+    shortened_at: int | None = None,
 ) -> StageResult:
     """Train one stage of a system.
 
@@ -288,6 +294,8 @@ def fit_stage(
       is_stopped: as in `fit`.
       session: as in `fit`.
       max_memory: as in `fit`.
+      shortened_at: iteration from which what is left of the stage is done in a tenth of the steps, at least 100, as
+        `Session.is_shortened` does; None: the checkpoint's, or none.
 
     Returns:
       The model after the stage, and its history.
@@ -316,7 +324,7 @@ def fit_stage(
         begin = resume
     if not isinstance(progress, Progress):
         progress = Progress(progress)
-    run = StageRun(scene, system, index, begin, num_restored, session, max_memory, progress)
+    run = StageRun(scene, system, index, begin, num_restored, session, max_memory, progress, shortened_at)
     run.train(on_checkpoint, checkpoint_every, on_log, is_stopped)
     return _result_of(run, scene, is_last=index == len(stages) - 1)
 

@@ -7,6 +7,7 @@ after it stay idle (`step.TrainState.status`); the loop removes the cause and la
 import contextlib
 import dataclasses
 import datetime
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 
@@ -56,6 +57,10 @@ WORTH_COMPILING = 1_000
 """Remaining iterations for which it is worth compiling a step without statistics that nothing reads any more."""
 PLANNED_VIEWS = 64
 """Largest number of views that room is planned for."""
+SHORTENED = 0.1
+"""Steps that are left to a stage which is being shortened, as a share of its iterations that are left."""
+LEAST_SHORTENED = 100
+"""Smallest number of these steps, if as many iterations are left."""
 GROWTH_ROOM = 1.5
 """Pairs that lists may reach while a model is trained, as a multiple of the present ones."""
 
@@ -88,6 +93,11 @@ def are_events_decided_by_host(state: TrainState) -> bool:
     """
     devices = state.model.gaussians.means.devices()
     return all(device.platform != "cpu" for device in devices)
+
+
+def is_multiple_between(before: int, after: int, every: int) -> bool:
+    """Return whether there is a multiple of `every` above `before` and up to `after`."""
+    return after // every > before // every
 
 
 class Session:
@@ -126,6 +136,10 @@ class Session:
         """Shapes of textures."""
         self.room = TileRoom()
         """Capacities of tile lists, by appearance, rows and image size."""
+        self.is_shortened = False
+        """Set it to True, from any thread, to finish training soon: what is left of the stage under way is done in a
+        tenth of the steps, and so is each later stage. A step then counts as several iterations, so that schedules
+        reach their end and all events between steps happen."""
 
     def check_batch_size(self, batch_size: int) -> None:
         """Raise ValueError unless each device draws the same number of views."""
@@ -151,6 +165,7 @@ class StageRun:
         session: Session | None = None,
         max_memory: int | None = None,
         progress: Progress = Progress(),  # noqa: B008 - immutable
+        shortened_at: int | None = None,
     ):
         """Args:
         scene: training views.
@@ -161,6 +176,8 @@ class StageRun:
         session: what trainings of this process share; None: a new one.
         max_memory: bytes that may be in use; None: what the machine or the GPU has available.
         progress: how progress is shown, and what follows the stage.
+        shortened_at: iteration from which the stage is shortened, as `Session.is_shortened` does; None: none, or the
+          checkpoint's.
         """
         self.session = session or Session()
         self.session.check_batch_size(system.batch_size)
@@ -181,11 +198,16 @@ class StageRun:
             if start.stage == index:
                 self._earlier = start.history
                 self.num_refused = start.num_refused
+                shortened_at = start.shortened_at if shortened_at is None else shortened_at
                 num_restored = start.num_restored if num_restored is None else num_restored
         else:
             state = state_of_model(start, self.stage, system, [view.name for view in scene.train], num_devices)
         self.state = divided(self.mesh, state)
         self.num_restored = num_restored or 0
+        self.shortened_at = shortened_at
+        """Iteration from which the stage is shortened; None: it is not."""
+        self._launched = int(self.state.iteration)
+        """Iteration of the last step that was launched, and not found impossible."""
 
         end = self.stage.iterations
         self.largest_loss = largest_loss(self.history)
@@ -198,9 +220,8 @@ class StageRun:
             self.views, self.order, end, system.background, is_first=index == 0, small_budget=system.small_budget
         )
         self.effects = StageEffects(self.stage, system, len({view.picture.size for view in self.views}))
-        most = max((event.most_gaussians or 0 for event in self.stage.events), default=0)
-        self._pace = Pace(int(self.state.iteration), end, most_gaussians=most, after=progress.after)
         self._progress = progress
+        self._pace = self._pace_from(self._launched)
         self.capacities: dict[Size, int] = {}
         """Capacities of the tile lists that steps are compiled for."""
         self.memory: float | None = None
@@ -250,6 +271,7 @@ class StageRun:
         return Checkpoint(
             self.system, self.index, self.whole_state, self.history, self.num_restored,
             devices=self.session.devices, num_refused=self.num_refused, views=self._recorded_views,
+            shortened_at=self.shortened_at,
         )  # fmt: skip
 
     def train(
@@ -262,26 +284,34 @@ class StageRun:
         """Run the stage to its end, then release its photographs. If it is stopped, write a last checkpoint and raise
         `Interrupted`.
         """
-        iteration = int(self.state.iteration)
+        iteration = self._launched
         end = self.stage.iterations
         # Several processes launch the same steps, and stop together.
         stops_launching = is_stopped if num_processes(self.mesh) == 1 else never
         display = (self._progress.display or Display)(self._progress.title or self.stage.name, iteration, end)
         with contextlib.closing(self.photographs), display:
             while iteration < end:
+                if self.shortened_at is None and any_process(self.mesh, self.session.is_shortened):
+                    self.shortened_at = iteration
+                    self._pace = self._pace_from(iteration)
+                    if on_checkpoint is not None:
+                        on_checkpoint(self.checkpoint)
                 # Python acts after `num_launched` steps, and at events and checkpoints.
-                pauses = [iteration + self.num_launched - iteration % self.num_launched, end]
-                pauses += [pause for pause in self._host_iterations if pause > iteration]
-                if checkpoint_every is not None:
-                    pauses.append(iteration + checkpoint_every - iteration % checkpoint_every)
+                paused = iteration
+                stride = self.stride_after(paused)
+                pauses = [paused + (self.num_launched - paused % self.num_launched) * stride, end]
+                pauses += [pause for pause in (*self._host_iterations, self.shortened_at or 0) if pause > paused]
+                if checkpoint_every is not None and stride == 1:
+                    pauses.append(paused + checkpoint_every - paused % checkpoint_every)
                 pause = min(pauses)
-                for info in self.steps(iteration + 1, pause, stops_launching):
-                    iteration += 1
-                    if iteration % LOG_EVERY == 0 or iteration == end:
+                for info in self.steps(min(paused + stride, pause), pause, stops_launching):
+                    before = iteration
+                    iteration = int(info.iteration)
+                    if is_multiple_between(before, iteration, LOG_EVERY * stride) or iteration == end:
                         self._log(iteration, info, on_log)
                     self.learning.observe(iteration, float(info.psnr))
                     row = self._rows[-1] if self._rows else None
-                    display.update(float(info.loss), float(info.psnr), row, self._pace.left(iteration))
+                    display.update(iteration, float(info.loss), float(info.psnr), row, self._pace.left(iteration))
                 ahead = self.effects.programs_ahead(iteration)
                 self._pace.time(iteration, self.effects.num_compiled, ahead, self.effects.seconds_a_program)
                 forecast = self._pace.forecast_at(iteration)
@@ -293,12 +323,16 @@ class StageRun:
                     self._host_events(iteration)
                 self.started += self.session.watch(self, is_stopped)
                 must_stop = any_process(self.mesh, is_stopped())
-                must_save = checkpoint_every is not None and iteration % checkpoint_every == 0 and iteration == pause
+                must_save = checkpoint_every is not None and is_multiple_between(paused, iteration, checkpoint_every)
                 if on_checkpoint is not None and (must_save or must_stop or iteration == end):
                     on_checkpoint(self.checkpoint)
                 if must_stop:
                     raise Interrupted(self.checkpoint)
         self.effects.warn_at_end(self.num_refused, self.state.model.num_rows)
+
+    def _pace_from(self, iteration: int) -> Pace:
+        most = max((event.most_gaussians or 0 for event in self.stage.events), default=0)
+        return Pace(iteration, self.stage.iterations, most_gaussians=most, after=self._progress.after)
 
     def _log(self, iteration: int, info: StepInfo, on_log: OnLog | None) -> None:
         """Add a row to the history."""
@@ -315,17 +349,35 @@ class StageRun:
 
     # Steps
 
+    def is_shortened_after(self, iteration: int) -> bool:
+        """Return whether the steps after an iteration are the ones of a shortened stage."""
+        return self.shortened_at is not None and iteration >= self.shortened_at
+
+    def stride_after(self, iteration: int) -> int:
+        """Return the number of iterations that a step after an iteration counts as."""
+        if self.shortened_at is None or not self.is_shortened_after(iteration):
+            return 1
+        left = self.stage.iterations - self.shortened_at
+        return math.ceil(left / max(LEAST_SHORTENED, SHORTENED * left))
+
     def steps(self, first: int, last: int, is_stopped: IsStopped = never) -> list[StepInfo]:
-        """Run iterations `first` to `last`. Stop at one that cannot be taken and remove its cause."""
+        """Run iterations `first` to `last`, with a step for each, or for `stride_after` of them.
+        Stop at a step that cannot be taken and remove its cause."""
+        iterations = [*range(first, last, self.stride_after(self._launched)), last]
         launched: list[StepInfo] = []
-        while first + len(launched) <= last and not is_stopped():
-            launched.append(self._launch(first + len(launched)))
+        for iteration in iterations:
+            if is_stopped():
+                break
+            launched.append(self._launch(iteration))
+            self._launched = iteration
         infos = jax.device_get(launched)  # Only here the loop waits for the device.
         # After a step that was not taken, all others are idle and have its status.
         taken = [info for info in infos if info.status == FINE]
         self.num_refused += sum(int(info.num_refused) for info in taken)
         if len(taken) < len(infos):
-            self._after_failure(first + len(taken), infos[len(taken)])
+            failed = infos[len(taken)]
+            self._launched = int(failed.iteration)
+            self._after_failure(iterations[len(taken)], failed)
         return taken
 
     def _launch(self, iteration: int) -> StepInfo:
@@ -354,7 +406,7 @@ class StageRun:
         """Return the arguments of the step of an iteration."""
         photographs, chosen = self.photographs.batch(iteration)
         render = self.render_settings(self._size(iteration))
-        clock = self.stage.clock(iteration, self.largest_loss)
+        clock = self.stage.clock(iteration, self.largest_loss, iteration - self._launched)
         happens = None
         if are_events_decided_by_host(self.state):
             happens = tuple(left is None or left > 0 for left in clock.num_left)
@@ -424,7 +476,7 @@ class StageRun:
         for place, (event, times) in enumerate(zip(self.stage.events, self.stage.times, strict=True)):
             if isinstance(event, HostEvent) and iteration in times:
                 self._apply(place, event, times.index(iteration) + 1, len(times))
-            if iteration == self._last_gathered[place]:
+            if iteration == self._last_gathered[place] and not self.is_shortened_after(iteration):
                 self._keep(place, None)
         self.state = divided(self.mesh, self.state)
 

@@ -58,12 +58,13 @@ class Display:
         """End the display."""
 
     def update(
-        self, loss: float, psnr: float, row: Mapping[str, float] | None, left: datetime.timedelta | None
+        self, done: int, loss: float, psnr: float, row: Mapping[str, float] | None, left: datetime.timedelta | None
     ) -> None:
-        """Count one iteration.
+        """Show that a step is done.
 
         Args:
-          loss: its loss.
+          done: number of iterations that are done, of `total`.
+          loss: loss of the step.
           psnr: its training PSNR in dB.
           row: last row of the history; None: there is none yet.
           left: remaining time of the run; None: it is not known yet.

@@ -1,5 +1,6 @@
 """A stage: an appearance, events, loss terms, learning rates and a length. A system is a sequence of stages."""
 
+import bisect
 import dataclasses
 import functools
 import inspect
@@ -273,16 +274,20 @@ class Stage(NamedFields):
         all_times = every_iteration(self.iterations)
         return tuple(event for event, times in zip(self.events, self.times, strict=True) if times == all_times)
 
-    def clock(self, iteration: int, largest_loss: float = math.inf) -> "Clock":
-        """Return the schedule of an iteration, whose step is not taken if its loss exceeds the largest (host)."""
+    def clock(self, iteration: int, largest_loss: float = math.inf, stride: int = 1) -> "Clock":
+        """Return the schedule of an iteration, whose step is not taken if its loss exceeds the largest. The step counts
+        as `stride` iterations, of which this is the last (host)."""
         num_left: list[int | None] = []
         for event, times in zip(self.events, self.times, strict=True):
             # An event of every iteration needs no condition in the step.
             if not isinstance(event, StepEvent) or times == every_iteration(self.iterations):
                 num_left.append(None)
-            else:
-                num_left.append(len(times) - times.index(iteration) if iteration in times else 0)
+                continue
+            num_past = bisect.bisect_right(times, iteration)
+            is_due = num_past > bisect.bisect_right(times, iteration - stride)
+            num_left.append(len(times) - num_past + 1 if is_due else 0)
         return Clock(
+            stride=stride,
             num_iterations=self.iterations,
             done=self.iterations if self.continues else 0,
             per_iteration=1.0 / self.iterations,
@@ -296,6 +301,8 @@ class Stage(NamedFields):
 class Clock(NamedTuple):
     """The schedule of a stage at an iteration as numbers, traced in the step."""
 
+    stride: int
+    """Number of iterations that the step counts as."""
     num_iterations: int
     done: int
     """Iterations of the schedules that are over when the stage begins: none, or all of them."""

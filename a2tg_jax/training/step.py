@@ -94,6 +94,8 @@ class StepInputs(NamedTuple):
 class StepInfo(NamedTuple):
     """Scalars about a step, for the host."""
 
+    iteration: Array
+    """Number of finished iterations of the stage."""
     loss: Array
     psnr: Array
     """Mean over the views, in dB."""
@@ -159,10 +161,15 @@ def train_step(settings: StepSettings, state: TrainState, inputs: StepInputs) ->
     chosen = jax.tree.map(lambda new, old: jnp.where(status == FINE, new, old), taken, kept)
     chosen = with_rows_divided(settings.mesh, chosen)
     return chosen, StepInfo(
-        loss=jnp.mean(drawn.loss), psnr=jnp.mean(drawn.psnr), num_pairs=jnp.max(drawn.num_pairs), status=status,
-        num_live=chosen.model.num_live, num_refused=tried.info.num_refused,
+        iteration=chosen.iteration,
+        loss=jnp.mean(drawn.loss),
+        psnr=jnp.mean(drawn.psnr),
+        num_pairs=jnp.max(drawn.num_pairs),
+        status=status,
+        num_live=chosen.model.num_live,
+        num_refused=tried.info.num_refused,
         terms=jax.tree.map(jnp.mean, drawn.terms),
-    )  # fmt: skip
+    )
 
 
 def attempt(settings: StepSettings, state: TrainState, inputs: StepInputs) -> Attempt:
@@ -170,7 +177,7 @@ def attempt(settings: StepSettings, state: TrainState, inputs: StepInputs) -> At
     stage = inputs.stage
     clock = inputs.clock
     scene_scale = inputs.scene_scale
-    iteration = state.iteration + 1
+    iteration = state.iteration + clock.stride
     model = state.model
     num_keys = sum(event.num_keys for event in stage.events if isinstance(event, StepEvent))
     # By iteration, so that repeated and resumed steps draw the same numbers.

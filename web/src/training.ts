@@ -12,6 +12,8 @@ export interface Status {
   readonly message: string;
   readonly stage: string;
   readonly isPaused: boolean;
+  /** Whether what is left is done in a tenth of the steps. */
+  readonly isFinishing: boolean;
   readonly iterations: number;
   readonly iteration: number;
   /** NaN before iteration 10, like the fields below. */
@@ -36,6 +38,7 @@ export function statusOf(value: unknown): Status | null {
     message: text("message"),
     stage: text("stage"),
     isPaused: fields.is_paused === true,
+    isFinishing: fields.is_finishing === true,
     iterations: number("iterations", 0),
     iteration: number("iteration", 0),
     loss: number("loss", NaN),
@@ -50,7 +53,7 @@ export function statusText(status: Status): string {
   if (Number.isNaN(status.loss)) {
     return status.stage === "" ? "Training is starting." : `Stage ${status.stage} is starting.`;
   }
-  const state = status.isPaused ? ", paused" : "";
+  const state = status.isPaused ? ", paused" : status.isFinishing ? ", finishing" : "";
   return (
     `${status.stage}: ${countText(status.iteration)} of ${countText(status.iterations)}${state}. ` +
     `Loss ${status.loss.toFixed(4)}, ${status.psnr.toFixed(2)} dB, ${countText(status.num)} Gaussians, ${bytesText(status.bytes)}.`
@@ -76,11 +79,17 @@ export async function followTraining(show: () => Promise<void>): Promise<boolean
   if (status === null) return false;
   element("training", HTMLElement).hidden = false;
   const button = element("pause", HTMLButtonElement);
-  button.addEventListener("click", () => {
-    const isPaused = button.dataset.paused === "yes";
-    void ask(isPaused ? "resume" : "pause", "POST").then((found) => {
+  const finish = element("finish", HTMLButtonElement);
+  const send = (path: string): void => {
+    void ask(path, "POST").then((found) => {
       if (found !== null) tell(found);
     });
+  };
+  button.addEventListener("click", () => {
+    send(button.dataset.paused === "yes" ? "resume" : "pause");
+  });
+  finish.addEventListener("click", () => {
+    send("finish");
   });
   for (let version = 0; status !== null; status = await ask(STATUS_FILE, "GET")) {
     tell(status);
@@ -91,6 +100,7 @@ export async function followTraining(show: () => Promise<void>): Promise<boolean
     await new Promise((resolve) => setTimeout(resolve, PERIOD));
   }
   button.disabled = true;
+  finish.disabled = true;
   setText("state", "The training has ended or cannot be reached. To see the result, run a2tg view.");
   return true;
 }
@@ -102,4 +112,5 @@ function tell(status: Status): void {
   const button = element("pause", HTMLButtonElement);
   button.textContent = status.isPaused ? "Resume" : "Pause";
   button.dataset.paused = status.isPaused ? "yes" : "no";
+  element("finish", HTMLButtonElement).disabled = status.isFinishing;
 }

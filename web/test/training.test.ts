@@ -20,6 +20,12 @@ test("status of a running training", () => {
   );
 });
 
+test("status of a training that is finishing", () => {
+  const figures = { iteration: 120, iterations: 2000, loss: 0.1, psnr: 21.5, num: 1500, bytes: 541792 };
+  const status = statusOf({ version: 3, stage: "textures", is_finishing: true, ...figures });
+  expect(status && statusText(status)).toContain("120 of 2,000, finishing.");
+});
+
 test("status before the first figures, and a message in their place", () => {
   const [begins, staged, told] = [{}, { stage: "gaussians" }, { message: "cannot be shown" }].map((more) =>
     statusOf({ version: 0, ...more }),
