@@ -76,17 +76,17 @@ def test_a_scene_becomes_a_page_by_printed_commands_and_the_same_command_continu
     words = ["make", str(tmp_path / "toy"), "--out", str(tmp_path / "out"), "--no-open"]
     assert cli.main(words) == 0
     printed = capsys.readouterr().out
-    assert re.findall(r"^\$ a2tg (\w+)", printed, flags=re.MULTILINE) == ["train", "export", "render"]
+    assert re.findall(r"^\$ a2tg (\w+)", printed, flags=re.MULTILINE) == ["train", "export", "render", "render"]
     assert "64×48 pixels, 60.0 kB, 30 iterations" in printed
     assert read_record(RunFolder(tmp_path / "out" / "run")).options.stage1_iterations == 20
     for name in ("toy.html", "toy.png", "run/report.html"):
         assert (tmp_path / "out" / name).is_file(), name
-    assert len(list((tmp_path / "out" / "turntable").glob("*.png"))) == 2
+    assert len(list((tmp_path / "out" / "flight").glob("frame_*.png"))) == 2
 
     # The run exists: nothing is chosen or trained again.
     monkeypatch.setattr("a2tg_jax.results.minutes.choose_training", None)
     assert cli.main(words) == 0
-    assert re.findall(r"^\$ a2tg (\w+)", capsys.readouterr().out, flags=re.MULTILINE) == ["export", "render"]
+    assert re.findall(r"^\$ a2tg (\w+)", capsys.readouterr().out, flags=re.MULTILINE) == ["export", "render", "render"]
 
 
 def test_files_of_another_origin_are_not_replaced(tmp_path, capsys):

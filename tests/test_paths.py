@@ -9,7 +9,7 @@ from small_values import centers_of
 
 from a2tg_jax import Camera, look_at, path_through, turntable
 from a2tg_jax.core.origin import vertical_of
-from a2tg_jax.data.capture_geometry import central_camera
+from a2tg_jax.data.capture_geometry import front_camera
 from a2tg_jax.io.path_file import load_views
 
 
@@ -92,11 +92,11 @@ def test_one_view_is_a_still_flight_and_equal_views_do_no_harm():
 # Turntables
 
 
-def ring(num: int = 12, rolled: float = 0.0) -> list[Camera]:
-    """Level cameras on an arc of 80° that look at (1, 2, 3) from above, each rolled a little."""
+def ring(num: int = 12, rolled: float = 0.0, arc: float = 80.0) -> list[Camera]:
+    """Level cameras on an arc of some degrees that look at (1, 2, 3) from above, each rolled a little."""
     subject = np.array([1.0, 2.0, 3.0])
     cameras = []
-    for index, angle in enumerate(np.radians(np.linspace(-40, 40, num))):
+    for index, angle in enumerate(np.radians(np.linspace(-arc / 2, arc / 2, num))):
         tilt = np.radians(26 + 11 * np.sin(2 * index))
         outward = np.array([np.cos(tilt) * np.cos(angle), np.cos(tilt) * np.sin(angle), np.sin(tilt)])
         viewmat = np.array(look_at(subject + 4 * outward, subject, width=64, height=48).viewmat)
@@ -121,18 +121,44 @@ def test_a_turntable_is_a_level_closed_loop_around_the_subject():
     assert (viewmats[:, 1, :3] @ up < 0).all() and (centers[:, 2] > 3).all()
     steps = np.linalg.norm(centers - np.roll(centers, 1, axis=0), axis=1)
     np.testing.assert_allclose(steps, steps[0], rtol=1e-3)
-    np.testing.assert_allclose(
-        np.cross(centers[0] - [1, 2, 3], np.asarray(ring()[0].center) - [1, 2, 3])[2], 0, atol=0.05
-    )
+    # It begins at the front.
+    front = ring()[front_camera(np.array([c.viewmat for c in ring()], np.float64), UP)]
+    np.testing.assert_allclose(np.cross(centers[0] - [1, 2, 3], np.asarray(front.center) - [1, 2, 3])[2], 0, atol=0.05)
 
 
-def test_the_most_central_camera_is_in_the_middle_and_looks_at_the_subject():
-    viewmats = np.array([camera.viewmat for camera in ring(13)])
-    assert abs(central_camera(viewmats) - 6) <= 1
-    centers = centers_of(viewmats)
-    viewmats[5:8, :3, :3] = Rotation.from_euler("y", 20, degrees=True).as_matrix() @ viewmats[5:8, :3, :3]
-    viewmats[5:8, :3, 3] = -np.einsum("vij,vj->vi", viewmats[5:8, :3, :3], centers[5:8])
-    assert central_camera(viewmats) in (4, 8)
+def moved_away(viewmats, factor):
+    """The cameras of `ring` at another distance from its subject, at (1, 2, 3)."""
+    moved = viewmats.copy()
+    centers = [1, 2, 3] + factor * (centers_of(viewmats) - [1, 2, 3])
+    moved[:, :3, 3] = -np.einsum("vij,vj->vi", viewmats[:, :3, :3], centers)
+    return moved
+
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def test_the_front_of_a_surrounded_subject_is_where_the_first_photograph_was_taken():
+    viewmats = np.array([camera.viewmat for camera in ring(24, arc=345)], np.float64)
+    assert front_camera(viewmats, UP) == 0
+    assert front_camera(np.roll(viewmats, -7, axis=0), UP) == 0
+    # The first one is too near to show the subject whole.
+    viewmats[:1] = moved_away(viewmats[:1], 0.4)
+    assert front_camera(viewmats, UP) in (1, 23)
+
+
+def test_the_front_of_cameras_on_one_side_is_where_most_of_them_are():
+    arc = np.array([camera.viewmat for camera in ring(9, arc=120)], np.float64)
+    assert abs(front_camera(arc, UP) - 4) <= 1
+    many = np.concatenate([arc, np.repeat(arc[7:8], 6, axis=0)])
+    assert front_camera(many, UP) >= 6
+    # Close-ups of the middle, however many, are not taken.
+    near = moved_away(np.repeat(arc[4:5], 5, axis=0), 0.4)
+    assert front_camera(np.concatenate([arc, near]), UP) < 9
+    # Nor is a camera that looks past the subject.
+    center = centers_of(arc)[4]
+    arc[4, :3, :3] = Rotation.from_euler("y", 20, degrees=True).as_matrix() @ arc[4, :3, :3]
+    arc[4, :3, 3] = -arc[4, :3, :3] @ center
+    assert front_camera(arc, UP) in (3, 5)
 
 
 def test_files_come_back(tmp_path):

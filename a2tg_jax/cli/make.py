@@ -17,7 +17,7 @@ from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.output_paths import check_apart, check_output
 
 NUM_FRAMES = 60
-"""Number of frames of the turntable."""
+"""Number of frames of the flight."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,8 +25,8 @@ class Make:
     """Make a page that shows a scene, from photographs or a video, in about as many minutes as you give.
 
     Finds the cameras, chooses the size of the photographs, the bytes and the iterations that this machine can train in
-    the time, trains, and writes a page, a picture and a turntable. Every step is a command, which is printed. After an
-    interruption, the same command continues.
+    the time, trains, and writes a page, a picture and a flight, a turntable if cameras surround the subject. Every step
+    is a command, which is printed. After an interruption, the same command continues.
 
     Examples:
       a2tg make photos/
@@ -39,14 +39,17 @@ class Make:
     minutes: float = 10.0
     """Time for all steps. The larger, the larger the photographs in training, and the more iterations."""
     out: Annotated[Path | None, defaulting_to("runs/NAME", "FOLDER")] = None
-    """Output folder: the scene, the run, NAME.html, NAME.png, and the turntable."""
+    """Output folder: the scene, the run, NAME.html, NAME.png, and the folder flight."""
     open: bool = True
     """Open the page if the machine has a display."""
 
     def run(self) -> None:
         from a2tg_jax.base.checks import check_number
+        from a2tg_jax.data.capture_geometry import SURROUNDED
         from a2tg_jax.data.load import is_scene
+        from a2tg_jax.results.frames import FRONT_NAME, unseen_angle
         from a2tg_jax.results.minutes import choose_training
+        from a2tg_jax.results.model_source import open_source
         from a2tg_jax.results.record import is_finished, read_record
 
         if not self.sources:
@@ -64,9 +67,9 @@ class Make:
         run = RunFolder(out / "run")
         page = out / f"{name}.html"
         picture = out / f"{name}.png"
-        turntable = out / "turntable"
+        flight = out / "flight"
         is_new = not is_regular(run.record)
-        for path in (page, picture, turntable):
+        for path in (page, picture, flight):
             if is_new and path.exists():
                 raise FileExistsError(f"{path} exists, and was made from no run in {out}: choose another `out`")
         scene = first
@@ -85,11 +88,14 @@ class Make:
             print_now(f"{run.path} is trained already; for another training, give another --out")
 
         run_step("export", [str(run.path), "--web", str(page), "--title", name, "--overwrite"])
-        flight = ["--path", "orbit", "--frames", str(NUM_FRAMES), "--out", str(turntable), "--overwrite"]
-        run_step("render", [str(run.path), *flight])
-        shutil.copyfile(min(turntable.glob("*.png")), picture)
+        run_step("render", [str(run.path), "--path", "front", "--out", str(flight), "--overwrite"])
+        shutil.copyfile(flight / FRONT_NAME, picture)
+        origin = open_source(run.path).model.origin
+        path = "orbit" if origin is not None and unseen_angle(origin) <= SURROUNDED else "smooth"
+        frames = ["--frames", str(NUM_FRAMES), "--out", str(flight), "--overwrite"]
+        run_step("render", [str(run.path), "--path", path, *frames])
         minutes, seconds = divmod(round(time.monotonic() - started), 60)
-        print_now(f"made in {minutes}:{seconds:02} minutes\npage: {page}\npicture: {picture}\nturntable: {turntable}/")
+        print_now(f"made in {minutes}:{seconds:02} minutes\npage: {page}\npicture: {picture}\nflight: {flight}/")
         if self.open:
             open_browser(page.resolve().as_uri())
 

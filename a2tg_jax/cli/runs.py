@@ -26,6 +26,7 @@ from a2tg_jax.results.folder import RunFolder, json_text, open_run, opened, runs
 from a2tg_jax.results.options import (
     FRAMES_PER_SECOND,
     MAX_LOSS,
+    STILLS,
     TEXTURED_FACES,
     BakeOptions,
     CameraPath,
@@ -126,14 +127,15 @@ class Render:
       a2tg render runs/fox --frames 240 --fps 60
       a2tg render runs/fox --size 1920x1080
       a2tg render runs/fox --path orbit --frames 240 --out fox-orbit
+      a2tg render runs/fox --path front
       a2tg render runs/fox --path test --out fox-test
       a2tg render runs/fox --path path.json --out fox-flight
     """
 
     folder: RunFolderPath
     path: CameraPath | Path = "smooth"
-    """Camera path: smooth (a flight past the cameras), orbit (a turntable around the subject), test (the test views),
-    or a file (*.json) saved in a2tg view."""
+    """Camera path: smooth (a flight past the cameras), orbit (a turntable around the subject), front (one frame, at
+    which the viewer opens), test (the test views), or a file (*.json) saved in a2tg view."""
     frames: int = 120
     """Number of frames of the flight."""
     fps: float = FRAMES_PER_SECOND
@@ -144,7 +146,7 @@ class Render:
         defaulting_to("1280x720, or 720x1280 if the photographs are upright"),
     ] = None
     """Width and height of the frames in pixels, such as 1920x1080; test views keep theirs by default. Views of another
-    aspect are cropped, but a turntable shows them whole, with more at two sides."""
+    aspect are cropped, but orbit and front show them whole, with more at two sides."""
     supersample: int = 1
     """Factor k by which frames are drawn larger and averaged: without aliasing where frames are smaller than the
     photographs, at k² times the cost."""
@@ -162,13 +164,14 @@ class Render:
         out = self.out or run.path / "frames"
         check_rate(self.fps)
         # Fields of the class are the defaults.
-        if self.path == "test" and (self.frames, self.fps) != (Render.frames, Render.fps):
-            raise ValueError("--frames and --fps have no effect on --path test: leave them out")
+        is_flight = self.path not in STILLS
+        if not is_flight and (self.frames, self.fps) != (Render.frames, Render.fps):
+            raise ValueError(f"--frames and --fps have no effect on --path {self.path}: leave them out")
         size = None if self.size is None else parse_size(self.size)
         if self.supersample < 1:
             raise ValueError(f"--supersample must be at least 1; got {self.supersample}")
         check_output(out)
-        if self.path != "test":
+        if is_flight:
             # Before minutes of rendering.
             FrameFolder(out).check([video_name()], overwrite=self.overwrite)
         paths = render_frames(
@@ -183,7 +186,7 @@ class Render:
             overwrite=self.overwrite,
         )
         print(f"wrote {counted(len(paths), 'frame')} to {out}/")
-        if self.path != "test":
+        if is_flight:
             video = write_video(paths, frames_per_second=self.fps)
             if video.suffix != ".mp4":
                 print("no video: ffmpeg is not installed; install it for MP4 (apt install ffmpeg, brew install ffmpeg)")
@@ -292,7 +295,7 @@ class Export:
     photographs: bool = False
     """Add the photographs of the run's cameras to the page."""
     title: str | None = None
-    """Title of the page, instead of the names of scene and model."""
+    """Title of the page, instead of the name of the scene."""
     model: LastModel = None
     edit: EditFile = None
     overwrite: bool = False

@@ -14,7 +14,9 @@ from a2tg_jax.core.cameras import MAX_SKEW, check_camera, checked_cameras
 from a2tg_jax.data.capture_geometry import (
     camera_centers,
     distance_to_subject,
+    front_camera,
     matrices_of,
+    outlying_cameras,
     subject_of,
     without_outlying,
 )
@@ -29,8 +31,8 @@ TURN_WEIGHT = 0.5
 def turntable(cameras: Sequence[Camera], num_frames: int, up: ArrayLike | None = None) -> list[Camera]:
     """Return a closed orbit around the subject, the point nearest to all optical axes.
 
-    It keeps the cameras' mean distance and elevation, looks at the subject with a level horizon, and begins at the side
-    of the first camera. Cameras far from all others do not count.
+    It keeps the cameras' mean distance and elevation, looks at the subject with a level horizon, and begins at its
+    front. Cameras far from all others do not count.
 
     Args:
       cameras: at least one; the first one's intrinsics and image size are used throughout.
@@ -58,8 +60,8 @@ def turntable(cameras: Sequence[Camera], num_frames: int, up: ArrayLike | None =
     distances = np.maximum(np.linalg.norm(offsets, axis=1), 1e-12)
     elevation = np.arcsin(np.clip(offsets @ up / distances, -1, 1)).mean()
     elevation = np.clip(elevation, -LARGEST_ELEVATION, LARGEST_ELEVATION)
-    # The unit direction of the first offset perpendicular to the vertical; any such one if the offset is vertical.
-    for vector in (offsets[0], *np.eye(3)):
+    # The unit direction of the front's offset perpendicular to the vertical; any such one if the offset is vertical.
+    for vector in (offsets[front_camera(viewmats, up)], *np.eye(3)):
         across = vector - (vector @ up) * up
         if np.linalg.norm(across) > 1e-3 * np.linalg.norm(vector):
             break
@@ -71,6 +73,16 @@ def turntable(cameras: Sequence[Camera], num_frames: int, up: ArrayLike | None =
         outward = np.cos(elevation) * heading + np.sin(elevation) * up
         orbit.append(looking(subject + radius * outward, -outward, -up))
     return _moved(cameras[0], orbit)
+
+
+def front_view(origin: Origin) -> int:
+    """Return the index of the camera that shows the subject's front: a training view, if there is one, and not far from
+    all others."""
+    candidates = [index for index, is_test in enumerate(origin.is_test) if not is_test] or range(len(origin.names))
+    ordered = np.array(sorted(candidates, key=origin.names.__getitem__))
+    viewmats = np.asarray(origin.viewmats, np.float64)[ordered]
+    near = np.flatnonzero(~outlying_cameras(viewmats))
+    return int(ordered[near[front_camera(viewmats[near], origin.vertical)]])
 
 
 def look_at(

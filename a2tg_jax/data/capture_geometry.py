@@ -21,6 +21,12 @@ next two, in units of the distance of the other cameras from their subject."""
 FARTHEST = 30.0
 """Distance beyond which a camera is outlying in any case: it sees the subject at a thirtieth of the others' size."""
 LARGEST_MISS = 3.0
+SURROUNDED = np.radians(120)
+"""Largest angle about the vertical without a camera at which cameras surround their subject."""
+FRONT_ANGLE = np.radians(30)
+"""Angle between directions from the subject within which cameras show the same side of it."""
+FARTHER_COUNTS = 0.3
+"""Weight of a distance above the usual one, relative to one below."""
 
 
 def camera_centers(viewmats: np.ndarray) -> np.ndarray:
@@ -100,13 +106,37 @@ def without_outlying(cameras: Sequence[Camera]) -> list[Camera]:
     return [camera for camera, is_far in zip(cameras, is_outlying, strict=True) if not is_far]
 
 
-def central_camera(viewmats: np.ndarray) -> int:
-    """Return the index of the camera [V, 4, 4] whose axis passes nearest to the subject and which is nearest to the
-    median camera, with equal weight."""
+def largest_gap(viewmats: np.ndarray, up: np.ndarray) -> float:
+    """Return the largest angle in radians, at the subject and about the vertical `up` [3], without a camera [V, 4, 4];
+    2π with one camera."""
+    offsets = camera_centers(viewmats) - subject_of(viewmats)
+    side = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    angles = np.sort(np.arctan2(offsets @ np.cross(up, side), offsets @ side))
+    return float(np.diff(angles, append=angles[0] + 2 * np.pi).max())
+
+
+def front_camera(viewmats: np.ndarray, up: np.ndarray) -> int:
+    """Return the index of the camera [V, 4, 4] that shows the subject's front, about centred and not too near.
+
+    The front is the side of the first camera, where people begin, if cameras surround the subject, and otherwise the
+    side of most cameras. Deviations in angle (of `FRONT_ANGLE`), centre and logarithm of the distance are weighed.
+    Without a subject, it is the camera in the middle.
+    """
     centers = camera_centers(viewmats)
-    misses = np.linalg.norm(np.cross(subject_of(viewmats) - centers, viewmats[:, 2, :3]), axis=1)
-    remote = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
-    return int(np.argmin(misses + remote))
+    if np.isnan(distance_to_subject(viewmats)):
+        return int(np.argmin(np.linalg.norm(centers - centers.mean(axis=0), axis=1)))
+    offsets = centers - subject_of(viewmats)
+    distances = np.maximum(np.linalg.norm(offsets, axis=1), 1e-12)
+    usual = np.median(distances)
+    directions = offsets / distances[:, None]
+    cosines = np.clip(directions @ directions.T, -1, 1)
+    closeness = np.exp(-0.5 * (np.arccos(cosines) / FRONT_ANGLE) ** 2)
+    seen = closeness[0] if largest_gap(viewmats, up) < SURROUNDED else closeness.mean(axis=0)
+    misses = np.linalg.norm(np.cross(offsets, viewmats[:, 2, :3]), axis=1) / usual
+    farther = np.log(distances / usual)
+    # Near cameras may cut the subject off; far ones only show it smaller.
+    deviations = np.where(farther < 0, -farther, FARTHER_COUNTS * farther)
+    return int(np.argmax(seen / seen.max() - misses - deviations))
 
 
 def upright_rotation(vertical: np.ndarray) -> np.ndarray:

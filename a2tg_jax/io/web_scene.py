@@ -10,7 +10,7 @@ import numpy as np
 
 from a2tg_jax import Model
 from a2tg_jax.base.even_spacing import evenly_chosen
-from a2tg_jax.data.capture_geometry import central_camera
+from a2tg_jax.data.camera_paths import front_view
 from a2tg_jax.io.columns import Choice, opacities_of
 from a2tg_jax.io.compact import CompactChoices, encode_model
 from a2tg_jax.io.edit_file import scores_of
@@ -63,10 +63,8 @@ def encode_web_scene(
     model = dataclasses.replace(model, gaussians=dataclasses.replace(model.gaussians, log_scales=raised))
     page: dict[str, object] = {"title": title, "note": note, "near_plane": near_plane}
     if model.origin is not None and len(model.origin.names):
-        # The viewer opens at the most central one of the training cameras.
-        is_test = model.origin.is_test
-        candidates = np.flatnonzero(~is_test) if not np.all(is_test) else np.arange(len(is_test))
-        page["first"] = int(candidates[central_camera(model.origin.viewmats[candidates])])
+        # The viewer opens at the subject's front.
+        page["first"] = front_view(model.origin)
     # Stable, so that the same model gives the same file.
     order = np.argsort(-importance(model), kind="stable")
     return encode_model(model, dataclasses.replace(CHOICES, coder=coder), order=order, page=page, floaters=scores)

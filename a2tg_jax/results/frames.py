@@ -9,24 +9,27 @@ import os
 import re
 import shutil
 import subprocess
+import warnings
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import get_args
 
 import jax.numpy as jnp
+import numpy as np
 from PIL import Image
 
-from a2tg_jax import Camera, Model, Renderer, path_through, resize_camera, smooth_path, turntable
+from a2tg_jax import Camera, Model, Origin, Renderer, path_through, resize_camera, smooth_path, turntable
 from a2tg_jax.base.atomic import replacing, write_whole
 from a2tg_jax.base.regular_files import is_regular, read_regular
 from a2tg_jax.base.text import did_you_mean, shortened
-from a2tg_jax.data.capture_geometry import without_outlying
+from a2tg_jax.data.camera_paths import front_view
+from a2tg_jax.data.capture_geometry import SURROUNDED, largest_gap, matrices_of, without_outlying
 from a2tg_jax.host.progress_bars import progress_over
 from a2tg_jax.io.path_file import load_views
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.images import picture_names, save_animation, to_uint8, write_png
 from a2tg_jax.results.model_source import open_source
-from a2tg_jax.results.options import FRAMES_PER_SECOND, CameraPath
+from a2tg_jax.results.options import FRAMES_PER_SECOND, STILLS, CameraPath
 from a2tg_jax.results.output_paths import check_new
 
 FLIGHT_SIZE = (1280, 720)
@@ -38,6 +41,7 @@ LIST = ".a2tg-frames"
 MOST_BYTES = 1 << 26
 FRAME_NAME = "frame_%04d.png"
 """File name of a flight's frame by its number, in Python's and ffmpeg's format."""
+FRONT_NAME = "front.png"
 FRAME = re.compile(r"frame_\d{4,}\.png")
 
 
@@ -106,16 +110,16 @@ def render_frames(
 ) -> list[Path]:
     """Write one PNG per frame and return their paths. The photographs are not needed.
 
-    The folder gets frame_0000.png … of a path, or NAME.png of the test views. Files of earlier renders are replaced,
-    and frames of a longer path deleted; other files need `overwrite`.
+    The folder gets frame_0000.png … of a path, front.png, or NAME.png of the test views. Files of earlier renders are
+    replaced, and frames of a longer path deleted; other files need `overwrite`.
 
     Args:
-      route: the test views, a smooth path past all cameras, an orbit around the subject, or a path through the views in
-        a file that the viewer saved.
+      route: the test views, a smooth path past all cameras, an orbit around the subject, its front alone, or a path
+        through the views in a file that the viewer saved.
       name: model to render; None: the last one of the run's main system.
       edit: file of an edit that is applied before.
-      size: width and height of the frames; an orbit shows whole views, and other views are cropped to their aspect;
-        None: the cameras' sizes for test views, otherwise `FLIGHT_SIZE`, or upright if the first camera is.
+      size: width and height of the frames; orbit and front show whole views, and other views are cropped to their
+        aspect; None: the cameras' sizes for test views, otherwise `FLIGHT_SIZE`, or upright if the first camera is.
 
     Raises:
       ValueError, OSError: if that stage is not finished, the views or the path are missing, or a file is in the way.
@@ -131,7 +135,7 @@ def render_frames(
         size = FLIGHT_SIZE if first.width >= first.height else FLIGHT_SIZE[::-1]
     if size is not None:
         # Cropped turntables would cut off the subject, which photographs fill.
-        resized = widen_camera if route == "orbit" else crop_camera
+        resized = widen_camera if route in ("orbit", "front") else crop_camera
         cameras = {file_name: resized(camera, *size) for file_name, camera in cameras.items()}
     folder = FrameFolder(out)
     folder.check(cameras, overwrite=overwrite)
@@ -140,8 +144,8 @@ def render_frames(
     for file_name, camera in progress_over(list(cameras.items()), "frames", "frame"):
         with folder.writing(file_name) as temporary:
             write_png(temporary, to_uint8(renderer(camera).color))
-    # A render of test views leaves a flight's frames in place.
-    folder.tidy(cameras, drops_frames=route != "test")
+    # Single views leave a flight's frames in place.
+    folder.tidy(cameras, drops_frames=route not in STILLS)
     return [out / file_name for file_name in cameras]
 
 
@@ -205,13 +209,27 @@ def _cameras(model: Model, route: CameraPath | Path, num_frames: int) -> dict[st
     cameras = list(origin.cameras)
     if route == "smooth":
         return _numbered(smooth_path(without_outlying([cameras[index] for index in by_name]), num_frames))
+    if route == "front":
+        return {FRONT_NAME: cameras[front_view(origin)]}
     if route == "orbit":
+        gap = unseen_angle(origin)
+        if gap > SURROUNDED:
+            warnings.warn(
+                f"no camera is in {np.degrees(gap):.0f}° of this orbit, where the model shows what no photograph "
+                "shows: `path` smooth stays where photographs were taken",
+                stacklevel=3,
+            )
         return _numbered(turntable([cameras[index] for index in by_name], num_frames, origin.up))
     tests = {origin.names[index]: cameras[index] for index in by_name if origin.is_test[index]}
     if not tests:
         raise ValueError("the run has no test views; render a path instead with `path` smooth")
     names = picture_names(tests)
     return {names[name]: camera for name, camera in tests.items()}
+
+
+def unseen_angle(origin: Origin) -> float:
+    """Return the largest angle around the subject, in radians, without a camera."""
+    return largest_gap(matrices_of(without_outlying(list(origin.cameras))), origin.vertical)
 
 
 def crop_camera(camera: Camera, width: int, height: int) -> Camera:

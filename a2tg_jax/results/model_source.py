@@ -174,7 +174,7 @@ def _source_of_run(run: RunFolder, name: str | None) -> Source:
         warnings.warn(f"{note}{advice}", stacklevel=3)
     return Source(
         model=model,
-        title=f"{record.scene.name} · {planned.name}",
+        title=record.scene.name,
         note="" if is_finished else note,
         settings=settings_of(planned.system),
         load_scene=load_scene,

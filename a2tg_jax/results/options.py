@@ -9,7 +9,9 @@ MAX_LOSS = 0.05
 TEXTURED_FACES = 100_000
 """Default number of faces of a mesh with a texture."""
 FRAMES_PER_SECOND = 30
-CameraPath = Literal["test", "smooth", "orbit"]
+CameraPath = Literal["smooth", "orbit", "front", "test"]
+STILLS = ("front", "test")
+"""Camera paths that are single views."""
 TextureSource = Literal["none", "renders", "photographs"]
 
 

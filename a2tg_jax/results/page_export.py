@@ -130,7 +130,7 @@ def export_comparison(sources: Sequence[Source], out: Path, *, overwrite: bool =
     check_new(out, "`out`", overwrite=overwrite)
     first, second = sources
     if not np.allclose(_world(first), _world(second), rtol=1e-6, atol=1e-4):
-        raise ValueError(f"{first.title} and {second.title} are in different worlds: give models of one scene")
+        raise ValueError(f"{first.path} and {second.path} are in different worlds: give models of one scene")
     titles = [_place_of(source.path) for source in sources]
     if titles[0] == titles[1]:
         titles = [str(source.path) for source in sources]

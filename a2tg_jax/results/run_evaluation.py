@@ -103,7 +103,7 @@ def evaluate_run(run: RunFolder, scene: Scene | None = None, *, lpips_weights: P
     save_ply(run.own(run.point_cloud), main, world="upright")
     # Browsers cannot show subclasses of Appearance.
     if main.appearance.is_portable:
-        data = encode_web_scene(main, title=f"{scene.name} · {result.main}")
+        data = encode_web_scene(main, title=scene.name)
         write_whole(run.own(run.viewer), viewer_html_with(data))
     camera = (*scene.test, *scene.train)[0].camera
     starts = {name: plan[name].first_iteration for name in models}

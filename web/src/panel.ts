@@ -98,7 +98,7 @@ export class Panel {
     }
   }
 
-  /** Go to the view in the address, or to the most central camera. */
+  /** Go to the view in the address, or to the camera that shows the front. */
   ready(): void {
     if (!this.followLink()) this.restart();
   }

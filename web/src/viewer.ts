@@ -121,7 +121,7 @@ export class Viewer implements Steered {
     splats.sort(this.depthRow);
   }
 
-  /** Go to the most central camera, or to where most of the scene is seen, with the vertical of the cameras. */
+  /** Go to the camera that shows the front, or to where most of the scene is seen, with the vertical of the cameras. */
   settle({ header }: Splats): void {
     const first = header.cameras.at(header.first);
     const extent = extentOf(header.means);
