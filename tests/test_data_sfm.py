@@ -10,9 +10,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from PIL import ExifTags, Image
+from scipy.ndimage import gaussian_filter
 from test_data_colmap import dot_place, write_scene as write_colmap
 
 from a2tg_jax import load_scene, look_at, run_sfm
+from a2tg_jax.cli import main as cli
 from a2tg_jax.core.origin import vertical_of
 from a2tg_jax.data import sfm, synthetic
 from a2tg_jax.data.colmap_library import pycolmap
@@ -438,6 +440,44 @@ def test_photographs_that_are_left_out_are_named():
     with pytest.warns(UserWarning, match="between 8.jpg and 11.jpg, 20.jpg and 22.jpg$"):
         placed = [name for name in NAMES if name not in ("0.jpg", "9.jpg", "10.jpg", "21.jpg")]
         sfm._check_models([Reconstruction(placed)], sorted(NAMES), "photos", "exhaustive", many)
+
+
+def test_blurred_photographs_are_named(tmp_path):
+    """Half of them, by a lens out of focus; another content alone is not blurred."""
+    random = np.random.default_rng(0)
+    names = [f"{number}.jpg" for number in range(12)]
+    for number, name in enumerate(names):
+        size = (240 + 60 * (number % 3), 320)
+        noise = gaussian_filter(random.normal(size=size), 1.5 + 0.1 * (number % 4))
+        if number >= 6:
+            noise = gaussian_filter(noise, 4.0) * 3
+        Image.fromarray(np.uint8(np.clip(128 + 300 * noise, 0, 255))).save(tmp_path / name, quality=95)
+    assert sfm.blurred_photos(tmp_path, names) == tuple(sorted(names[6:]))
+    assert sfm.blurred_photos(tmp_path, names[:6]) == ()
+    assert sfm.blurred_photos(tmp_path, ()) == ()
+    many = sfm.Matches(999, 700, (), ())
+    placed = [Reconstruction(names[:8])]
+    with pytest.warns(
+        UserWarning, match=r"2 of 8 photographs with a camera are blurred .* \(6.jpg, 7.jpg\)$"
+    ) as caught:
+        sfm._check_models(placed, names, "photos", "exhaustive", many, names[6:])
+    assert "4 of them are blurred (8.jpg, 9.jpg, 10.jpg, 11.jpg)" in str(caught[-1].message)
+
+
+def test_two_subjects_are_told_apart():
+    parts = [Reconstruction(NAMES[:160]), Reconstruction(NAMES[160:300])]
+    with pytest.warns(UserWarning, match=r"160, 140 .* several subjects, give each a folder: .* 160.jpg, 161.jpg"):
+        sfm._check_models(parts, NAMES, "photos", "exhaustive", sfm.Matches(999, 700, (), ()))
+
+
+def test_a_part_of_the_photographs_is_no_success(tmp_path, monkeypatch, capsys):
+    (tmp_path / "photos").mkdir()
+    monkeypatch.setattr(sfm, "run_sfm", lambda *_, **__: sfm.SfmSummary(24, 11, 300, 0.5, 640))
+    monkeypatch.setattr("a2tg_jax.results.figures.save_camera_picture", lambda *_: None)
+    assert cli.main(["sfm", str(tmp_path / "photos"), str(tmp_path / "scene")]) == 2
+    error = capsys.readouterr().err
+    assert "only 11 of 24 photographs have a camera" in error
+    assert "To train it all the same: a2tg train" in error
 
 
 def test_gaps_are_between_photographs_of_one_folder():

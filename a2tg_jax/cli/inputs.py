@@ -13,6 +13,9 @@ from a2tg_jax.data.download import BENCHMARK_SETS, fetch
 from a2tg_jax.data.sfm_options import DEFAULT_FRAMES, CameraModel, Matching, Panorama
 from a2tg_jax.results.output_paths import check_apart, check_output
 
+LEAST_PLACED = 0.5
+"""Smallest share of the photographs with a camera with which finding cameras counts as successful."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Sfm:
@@ -83,6 +86,11 @@ class Sfm:
         )
         run = ["a2tg", "train", str(out), "--out", f"runs/{out.resolve().name}"]
         command = f"{shlex.join(run)} {quick_flags(summary.longest_side)}"
+        if summary.num_registered < LEAST_PLACED * summary.num_photos:
+            raise ValueError(
+                f"only {summary.num_registered} of {summary.num_photos} photographs have a camera, so that {out} shows "
+                f"less than you photographed; the warnings say what may help. To train it all the same: {command}"
+            )
         print(f"cameras: {out / CAMERA_PICTURE}\nscene: {out}; continue with: {command}")
 
     def _places(self) -> tuple[list[Path], Path]:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image
+from scipy.ndimage import laplace
 
 from a2tg_jax.base.checks import check_literal
 from a2tg_jax.base.regular_files import expanded
@@ -40,6 +41,12 @@ ADVICE = "take more, sharp and closer together: they should overlap by two third
 NO_DEPTH = "photographs that match show no depth, as if taken from one spot or of a flat surface: walk between them"
 MOSTLY_FLAT = 0.9
 """Share of matching pairs without depth from which a warning follows. In six captures it is at most 0.71."""
+SHARPNESS_SIDE = 640
+"""Longer side in pixels of the greyscale copies on which sharpness is measured."""
+SHARP_QUANTILE = 0.75
+BLURRED = 0.4
+"""A photograph is blurred if its sharpness is below this share of the quantile of all. In seven captures sharp ones
+have 0.5 at least, and ones blurred by 0.25 % of their width 0.1 to 0.5."""
 MOST_NAMED = 24
 MOST_GAPS = 5
 """Largest numbers of photographs, and of gaps between photographs, that a message names."""
@@ -136,7 +143,8 @@ def run_sfm(
         _extract_features(database, staged.folder, names, progress)
         _match_features(database, len(names), seed, matching, progress)
         models = _map(database, staged, work, seed, progress)
-        _check_models(models, names, given, matching, _read_matches(database))
+        blurred = blurred_photos(staged.folder, [name for group in staged.groups for name in group.names])
+        _check_models(models, names, given, matching, _read_matches(database), blurred)
         model = models[0]
         _turn_upright(model)
         with clock("undistorting", is_shown=progress):
@@ -319,10 +327,34 @@ def _read_matches(database: Path) -> Matches:
     return Matches(len(pairs), sum(kind in FLAT for _, kind in pairs), tuple(sorted(alone)), tuple(sorted(blank)))
 
 
+def blurred_photos(folder: Path, names: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of the photographs, of one scene, that are much less sharp than the others, sorted."""
+
+    def sharpness(name: str) -> float:
+        """Standard deviation of the Laplacian of a small greyscale copy."""
+        with Image.open(folder / name) as photo:
+            photo.draft("L", (SHARPNESS_SIDE, SHARPNESS_SIDE))
+            small = photo.convert("L")
+            small.thumbnail((SHARPNESS_SIDE, SHARPNESS_SIDE), Image.Resampling.BOX)
+            return float(laplace(np.asarray(small, np.float32)).std())
+
+    if not names:
+        return ()
+    found = np.array(map_in_threads(sharpness, names))
+    is_blurred = found < BLURRED * np.quantile(found, SHARP_QUANTILE)
+    return tuple(sorted(name for name, is_one in zip(names, is_blurred, strict=True) if is_one))
+
+
 def _check_models(
-    models: Sequence[Any], names: Sequence[str], given: str, matching: Matching, matches: Matches
+    models: Sequence[Any],
+    names: Sequence[str],
+    given: str,
+    matching: Matching,
+    matches: Matches,
+    blurred: Sequence[str] = (),
 ) -> None:
-    """Raise ValueError without a usable model, and warn of the photographs that the largest one leaves out.
+    """Raise ValueError without a usable model, and warn of the photographs that the largest one leaves out, and of
+    blurred ones.
 
     The models are sorted, the largest first; `given` names the sources in messages.
     """
@@ -333,9 +365,19 @@ def _check_models(
     has_no_depth = num_pairs > 1 and num_flat >= MOSTLY_FLAT * num_pairs
     if has_no_depth and is_scene:
         warnings.warn(f"{given}: {NO_DEPTH}; their poses are a guess", stacklevel=3)
+    blurred_in = [name for name in blurred if name in placed]
+    if blurred_in and is_scene:
+        warnings.warn(
+            f"{given}: {len(blurred_in)} of the photographs are blurred, and so will the scene be: take them again or "
+            f"remove them ({first_names(blurred_in, MOST_NAMED)})",
+            stacklevel=3,
+        )
     if not left_out:
         return
     reasons = []
+    blurred_out = [name for name in blurred if name not in placed]
+    if blurred_out:
+        reasons.append(f"{len(blurred_out)} of them are blurred ({first_names(blurred_out, MOST_NAMED)})")
     if blank:
         where = f"in {len(blank)} of them ({first_names(blank, MOST_NAMED)})"
         reasons.append(f"COLMAP finds no features, as in blank or very blurred pictures, {where}")
@@ -348,7 +390,11 @@ def _check_models(
         reasons.append("no two of them match: they show different things, are blurred, or are too far apart")
     if len(models) > 1:
         sizes = ", ".join(str(model.num_reg_images()) for model in models)
-        reasons.append(f"they fall into parts of {sizes} that do not connect, and the largest is kept")
+        second = sorted(models[1].image(number).name for number in models[1].reg_image_ids())
+        reasons.append(
+            f"they fall into parts of {sizes} that do not connect, and the largest is kept; if these are several "
+            f"subjects, give each a folder: the second part is {first_names(second, MOST_NAMED)}"
+        )
     if has_no_depth and not is_scene:
         reasons.append(NO_DEPTH)
     elif len(placed) < len(names) / 2 and len(blank) < len(names):
