@@ -466,7 +466,7 @@ def test_blurred_photographs_are_named(tmp_path):
 
 def test_two_subjects_are_told_apart():
     parts = [Reconstruction(NAMES[:160]), Reconstruction(NAMES[160:300])]
-    with pytest.warns(UserWarning, match=r"160, 140 .* several subjects, give each a folder: .* 160.jpg, 161.jpg"):
+    with pytest.warns(UserWarning, match=r"160, 140 .*several subjects, give each a folder: .* 160.jpg, 161.jpg"):
         sfm._check_models(parts, NAMES, "photos", "exhaustive", sfm.Matches(999, 700, (), ()))
 
 

@@ -47,6 +47,8 @@ SHARP_QUANTILE = 0.75
 BLURRED = 0.4
 """A photograph is blurred if its sharpness is below this share of the quantile of all. In seven captures sharp ones
 have 0.5 at least, and ones blurred by 0.25 % of their width 0.1 to 0.5."""
+ANOTHER_SUBJECT = 1 / 3
+"""Size of a part, as a share of the largest, from which it may be another subject."""
 MOST_NAMED = 24
 MOST_GAPS = 5
 """Largest numbers of photographs, and of gaps between photographs, that a message names."""
@@ -390,11 +392,11 @@ def _check_models(
         reasons.append("no two of them match: they show different things, are blurred, or are too far apart")
     if len(models) > 1:
         sizes = ", ".join(str(model.num_reg_images()) for model in models)
+        reasons.append(f"they fall into parts of {sizes} that do not connect, and the largest is kept")
         second = sorted(models[1].image(number).name for number in models[1].reg_image_ids())
-        reasons.append(
-            f"they fall into parts of {sizes} that do not connect, and the largest is kept; if these are several "
-            f"subjects, give each a folder: the second part is {first_names(second, MOST_NAMED)}"
-        )
+        if len(second) >= ANOTHER_SUBJECT * len(placed):
+            named = first_names(second, MOST_NAMED)
+            reasons.append(f"if they show several subjects, give each a folder: the second part is {named}")
     if has_no_depth and not is_scene:
         reasons.append(NO_DEPTH)
     elif len(placed) < len(names) / 2 and len(blank) < len(names):
