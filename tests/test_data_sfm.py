@@ -470,6 +470,16 @@ def test_two_subjects_are_told_apart():
         sfm._check_models(parts, NAMES, "photos", "exhaustive", sfm.Matches(999, 700, (), ()))
 
 
+def test_an_interrupted_search_says_that_it_begins_again(tmp_path, monkeypatch, capsys):
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    (tmp_path / "photos").mkdir()
+    monkeypatch.setattr(sfm, "run_sfm", interrupt)
+    assert cli.main(["sfm", str(tmp_path / "photos"), str(tmp_path / "scene")]) == 130
+    assert capsys.readouterr().err == "a2tg: interrupted; nothing was kept: the same command begins again\n"
+
+
 def test_a_part_of_the_photographs_is_no_success(tmp_path, monkeypatch, capsys):
     (tmp_path / "photos").mkdir()
     monkeypatch.setattr(sfm, "run_sfm", lambda *_, **__: sfm.SfmSummary(24, 11, 300, 0.5, 640))

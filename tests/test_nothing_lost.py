@@ -187,6 +187,9 @@ def test_a_full_disk_is_one_line_whatever_the_file(monkeypatch, filename):
         start = f"{filename}: the disk is {state}" if isinstance(filename, str | Path) else "the disk is full"
         text = error_text(OSError(28, "No space left on device", filename), "")
         assert text == f"{start}: make room, or write to another disk"
+        # As by shutil, which copies the first file to the second.
+        copied = error_text(OSError(28, "No space left on device", "source.jpg", None, filename), "")
+        assert copied == (text if filename else f"source.jpg: the disk is {state}: make room, or write to another disk")
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="/dev/full is Linux's")

@@ -11,6 +11,7 @@ from a2tg_jax.base.text import did_you_mean
 from a2tg_jax.cli.arguments import defaulting_to, print_now
 from a2tg_jax.data.download import BENCHMARK_SETS, fetch
 from a2tg_jax.data.sfm_options import DEFAULT_FRAMES, CameraModel, Matching, Panorama
+from a2tg_jax.host.signals import Stopped
 from a2tg_jax.results.output_paths import check_apart, check_output
 
 LEAST_PLACED = 0.5
@@ -69,16 +70,21 @@ class Sfm:
             if is_scene(source):
                 print(f"{source} has cameras already, which a2tg train reads; COLMAP finds them again", flush=True)
         check_output(out)
-        summary = run_sfm(
-            sources,
-            out,
-            masks=self.masks,
-            camera_model=self.camera_model,
-            matching=self.matching,
-            frames=self.frames,
-            panorama=self.panorama,
-            on_note=print_now,
-        )
+        try:
+            summary = run_sfm(
+                sources,
+                out,
+                masks=self.masks,
+                camera_model=self.camera_model,
+                matching=self.matching,
+                frames=self.frames,
+                panorama=self.panorama,
+                on_note=print_now,
+            )
+        except KeyboardInterrupt as interrupt:
+            stopped = Stopped.of(interrupt)
+            stopped.advice = "nothing was kept: the same command begins again"
+            raise stopped from None
         save_camera_picture(out, out / CAMERA_PICTURE)
         print(
             f"{summary.num_registered} of {summary.num_photos} photographs registered, {summary.num_points:,} points, "

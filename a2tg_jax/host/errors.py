@@ -33,17 +33,19 @@ def error_text(error: Exception, less_memory: str) -> str | None:
         return f"not enough memory{f' ({details})' if details else ''}: {less_memory}"
     if not (isinstance(error, OSError) and error.errno in NO_ROOM):
         return str(error) if isinstance(error, ValueError | OSError) else None
-    if not isinstance(error.filename, str | os.PathLike):
+    # Of two files, the second one was written.
+    written = error.filename2 or error.filename
+    if not isinstance(written, str | os.PathLike):
         return "the disk is full: make room, or write to another disk"
     details = ""
-    path = Path(error.filename).absolute()
+    path = Path(written).absolute()
     if error.errno == errno.ENOSPC:  # Free bytes say nothing about a quota.
         with contextlib.suppress(OSError):
             # The file's folder may be missing.
             free = shutil.disk_usage(next(above for above in (path, *path.parents) if above.is_dir())).free
             inodes = " or has no inodes left" if free > PLENTY else ""
             details = f"{inodes}, {free / 1e6:.1f} MB are free"
-    return f"{error.filename}: the disk is full{details}: make room, or write to another disk"
+    return f"{written}: the disk is full{details}: make room, or write to another disk"
 
 
 def as_argument(path: Path) -> str:

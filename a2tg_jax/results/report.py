@@ -38,6 +38,8 @@ WAYS = {
 """Titles of metrics up to exposure and pose, by the suffix of a split in metrics.json: test_color_fit, …"""
 EQUAL_BYTES = 0.01
 """Largest relative difference between sizes that count as equal."""
+WORSE = 1.0
+"""Difference in dB between training and held-out views that is visible."""
 FEW_PHOTOGRAPHS = 3.0
 """Difference in dB between training and held-out views from which new views need more photographs."""
 CROP_ZOOM = 3
@@ -257,6 +259,8 @@ def photographs_line(result: RunResult) -> str:
     train = main.train.psnr
     test = main.splits[held_out].psnr
     verdict = "views between the photographs are about as good"
+    if train - test >= WORSE:
+        verdict = "views between the photographs are somewhat worse"
     if train - test >= FEW_PHOTOGRAPHS:
         verdict = "few photographs; stay near where you stood, or take more"
     return f"{train:.1f} dB on training views, {test:.1f} held out: {verdict}"
