@@ -754,6 +754,20 @@ def test_a_checkpoint_is_a_model_for_every_command(scene, stopped, tmp_path, cap
     assert_same(run, stopped[1])
 
 
+def test_an_older_checkpoint_is_shown_if_the_newest_is_damaged(stopped, tmp_path):
+    run = RunFolder(shutil.copytree(stopped[0].path, tmp_path / "run"))
+    *oldest, older, newest = run.checkpoints(NAME)
+    newest.write_bytes(newest.read_bytes()[:100])
+    with pytest.warns(UserWarning) as caught:
+        shown = open_source(run.path).model
+    assert any(f"{newest.name}: " in str(one.message) and older.name in str(one.message) for one in caught)
+    assert_same_bits(shown, load_checkpoint(older).model_in(SOURCE.load()))
+    for path in (*oldest, older):
+        path.unlink()
+    with pytest.raises(ValueError, match=newest.name):
+        open_source(run.path)
+
+
 def test_a_checkpoint_needs_the_cameras_of_its_scene(stopped, tmp_path):
     run = RunFolder(shutil.copytree(stopped[0].path, tmp_path / "run"))
     write_record(run, dataclasses.replace(read_record(run), scene=SceneSource(str(tmp_path / "nowhere"))))

@@ -116,14 +116,22 @@ def chosen_stage(run: RunFolder, plan: RunPlan, name: str | None = None) -> tupl
 
 def trained_model(run: RunFolder, planned: PlannedStage, load_scene: Callable[[], Scene | None]) -> Model:
     """Return the model of a stage of which something was kept. A checkpoint has no cameras, so that the scene is read.
-    Raises FileNotFoundError if the scene is missing, and ValueError if a file cannot be read."""
+    If the newest checkpoint is damaged, an older one is taken, with a warning. Raises FileNotFoundError if the scene is
+    missing, and ValueError if no file can be read."""
     if is_regular(run.model(planned.name)):
         return load_model(run.model(planned.name))
-    path = run.checkpoints(planned.name)[-1]
+    *older, newest = run.checkpoints(planned.name)
     scene = load_scene()
     if scene is None:
-        raise FileNotFoundError(f"{path} has no cameras, and the scene that has them is missing")
-    return load_checkpoint(path, system=type(planned.system)).model_in(scene)
+        raise FileNotFoundError(f"{newest} has no cameras, and the scene that has them is missing")
+    try:
+        checkpoint = load_checkpoint(newest, system=type(planned.system))
+    except ValueError as error:
+        if not older:
+            raise
+        warnings.warn(f"{error}; {older[-1].name} is taken instead", stacklevel=2)
+        checkpoint = load_checkpoint(older[-1], system=type(planned.system))
+    return checkpoint.model_in(scene)
 
 
 def open_source(path: Path, name: str | None = None, edit: Path | None = None) -> Source:
