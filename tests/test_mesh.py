@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import surface_quality
+from scipy.spatial import cKDTree
 from small_values import centers_of
 
 import a2tg_jax as a2tg
@@ -19,7 +20,7 @@ from a2tg_jax.io.other_programs import upright
 from a2tg_jax.mesh import extract, triangles
 from a2tg_jax.mesh.extract import common_sphere, surface_of
 from a2tg_jax.mesh.files import mesh_files
-from a2tg_jax.mesh.fusion import BlockGrid, RenderedDepth, Space, fuse
+from a2tg_jax.mesh.fusion import NOTHING, BlockGrid, RenderedDepth, Space, fill, fuse
 from a2tg_jax.mesh.texturing import draw_view
 from a2tg_jax.mesh.triangles import largest_clusters
 from a2tg_jax.results import meshing
@@ -237,6 +238,59 @@ def test_a_model_becomes_a_mesh(model):
     assert radius == pytest.approx(2.4, rel=1e-3)
 
 
+def test_large_voxels_fill_what_small_ones_do_not_know():
+    """One half of a sphere has depths that are too uncertain for small voxels, whose surface there is a hole."""
+    voxel = 0.02
+    spaces = [Space.of(np.zeros(3), 2.0, voxel * 2**level, False) for level in range(3)]
+    grids = [BlockGrid(100_000_000) for _ in spaces]
+    for direction in AROUND:
+        camera = camera_at(1.5 * direction / np.linalg.norm(direction))
+        depths = sphere_depths(camera)
+        center, rays = rays_of(camera)
+        hits = center + rays * np.asarray(depths.depth)[..., None]
+        is_hit = np.asarray(depths.depth) > 0
+        depths = depths._replace(
+            depth=jnp.where(is_hit, depths.depth, NOTHING),
+            spread=jnp.where(is_hit & (hits[..., 0] > 0), 12 * voxel, 0.0).astype(jnp.float32),
+        )
+        for grid, space in zip(grids, spaces, strict=True):
+            fuse(grid, depths, space)
+
+    def half_of(mesh):
+        """Vertices at x > 0.1."""
+        return mesh.vertices[mesh.vertices[:, 0] > 0.1]
+
+    least = 0.3
+    assert len(half_of(surface_of(grids[0], spaces[0], least))) == 0
+    known = grids[0].distance.copy()
+    is_known = grids[0].weight > least
+    fill(grids[1], grids[2], least)
+    fill(grids[0], grids[1], least)
+    np.testing.assert_array_equal(grids[0].distance[is_known], known[is_known])
+    filled = half_of(surface_of(grids[0], spaces[0], least))
+    assert np.abs(np.linalg.norm(filled, axis=1) - RADIUS).max() < 2 * voxel
+    # Vertices are everywhere on that half: no direction is farther than three degrees from one.
+    exact = np.random.default_rng(0).normal(size=(500, 3))
+    exact = RADIUS * exact[exact[:, 0] > 0.3 * np.linalg.norm(exact, axis=1)]
+    exact = exact / np.linalg.norm(exact / RADIUS, axis=1, keepdims=True)
+    assert cKDTree(filled).query(exact)[0].max() < 2 * voxel
+
+
+def test_a_mesh_says_how_much_of_the_views_it_lacks(model):
+    whole = a2tg.extract_mesh(model, resolution=80)
+    part = a2tg.extract_mesh(model, resolution=80, least_weight=2.0)
+    assert whole.missing < 0.01
+    assert part.mesh.area < 0.95 * whole.mesh.area
+    assert part.missing > 0.02
+
+
+def test_default_voxels_are_no_smaller_than_pixels(model):
+    camera = model.origin.cameras[0]
+    distance = np.linalg.norm(np.asarray(camera.center))
+    found = a2tg.extract_mesh(model).voxel
+    assert found == pytest.approx(distance / float(camera.K[0, 0]), rel=0.05)
+
+
 def test_a_given_centre_and_cameras_of_a_lens(model):
     """The radius is measured from the centre. Depths are rendered by pinholes, whatever the lens of the photographs."""
     cameras = [dataclasses.replace(own, rays=jnp.zeros((own.height, own.width, 2))) for own in model.origin.cameras]
@@ -273,7 +327,7 @@ def test_far_splats_do_not_matter_within_the_radius(model):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"max_bytes": 200_000}, "takes more than 0.0002 GB after . of 14 views: lower `resolution`"),
+        ({"max_bytes": 200_000}, "takes more than 0.0002 GB: lower `resolution`"),
         ({"radius": 0.05, "center": np.array([3.0, 0, 0])}, "there is no surface within the radius"),
         ({"resolution": 0}, "resolution must be in"),
         ({"resolution": 10, "voxel": 0.1}, "`resolution` and `voxel` both"),
@@ -321,7 +375,7 @@ def test_the_command_writes_the_original_world(model, tmp_path, capsys):
         ("mesh . --clusters 0", "--clusters must be at least 1; got 0"),
         ("mesh . --max-memory 1000000GB", "--max-memory must be at most"),
         ("mesh cameras.npz --radius 0.1", "point that the cameras look at: give a larger --radius"),
-        ("mesh cameras.npz --voxel 2", "parts had fewer than 50 faces: raise --resolution, lower --voxel"),
+        ("mesh cameras.npz --voxel 4", "parts had fewer than 50 faces: raise --resolution, lower --voxel"),
         ("mesh cameras.npz --out taken.ply", "taken.ply exists; add --overwrite"),
         ("mesh taken.npz", "taken-mesh.glb exists; add --overwrite"),
         ("mesh taken.ply --out taken.ply --overwrite", "taken.ply is the model itself; choose another --out"),

@@ -49,7 +49,7 @@ FLAGS[EditOptions] = {
     "background": (arg(metavar="COLOR"),),
 }
 FLAGS[MeshOptions] = {
-    "resolution": (defaulting_to("512, unless --voxel is given", "N"),),
+    "resolution": (defaulting_to("512, or fewer for small photographs", "N"),),
     "voxel": (defaulting_to("radius / resolution", "LENGTH"),),
     "radius": (defaulting_to("twice the cameras' median distance from it", "LENGTH"),),
     "faces": (defaulting_to(f"all, or {TEXTURED_FACES:,} with a texture", "N"),),

@@ -1,6 +1,7 @@
 """Mesh extraction from a model: depths of views, their fusion, marching cubes, and cleaning (host)."""
 
 import dataclasses
+import itertools
 import time
 from collections.abc import Iterator, Sequence
 
@@ -12,22 +13,38 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from a2tg_jax import Camera, Model, Renderer, RenderSettings
+from a2tg_jax import Camera, Model, Renderer, RenderSettings, back_project
 from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.text import counted
 from a2tg_jax.core.cameras import checked_cameras
 from a2tg_jax.data.capture_geometry import camera_centers, outlying_cameras, subject_of
 from a2tg_jax.host.optional import optional
 from a2tg_jax.host.progress_bars import progress_over
-from a2tg_jax.mesh.fusion import SIDE, VOXELS, BlockGrid, GridFullError, Space, fuse, rendered_depth
+from a2tg_jax.mesh.fusion import (
+    NOTHING,
+    SIDE,
+    TRUNCATION,
+    VOXELS,
+    BlockGrid,
+    GridFullError,
+    RenderedDepth,
+    Space,
+    fill,
+    fuse,
+    rendered_depth,
+)
 from a2tg_jax.mesh.triangles import Mesh, largest_clusters
 from a2tg_jax.model import check_is_model
 
 MARCHING_CUBES = "skimage.measure", "a mesh needs scikit-image", "train"
 RESOLUTION = 512
-"""Default number of voxels along the radius."""
+"""Largest default number of voxels along the radius."""
 GRID_BYTES = 4 * 10**9
 """Default memory budget of the voxels."""
+MOST_LEVELS = 4
+"""Largest number of grids, each with voxels twice as large, from which unknown voxels of the finer ones are filled."""
+LONGEST_TRUNCATION = 0.25
+"""Largest truncation of a coarser grid, in radii: longer ones would mix both sides of the subject."""
 RADII = 2.0
 """Default radius, in median distances of the cameras from the centre."""
 LEAST_WEIGHT = 0.05
@@ -37,6 +54,8 @@ LEAST_FACES = 50
 """Default number of faces of the smallest of them, as in 2DGS."""
 BRICK = 16
 """Blocks along a side of a brick; marching cubes run brick by brick."""
+MOST_SAMPLED = 100_000
+"""Pixels of all views at which a missing surface is looked for, about."""
 SAME = 1e-3
 """Largest distance in voxels between two bricks' copies of a shared vertex."""
 
@@ -57,6 +76,8 @@ class MeshResult(NamedFields):
     """Number of views fused."""
     num_dropped: int
     """Number of small connected parts that cleaning removed."""
+    missing: float
+    """Share of the pixels of the views, of those with a depth within the radius, where the mesh has no surface."""
     num_bytes: int
     """Bytes of the voxel grid."""
     seconds: float
@@ -82,12 +103,13 @@ def extract_mesh(
     """Return the surface of a model as triangles, by fusion of rendered depths and marching cubes (2DGS).
 
     The depths of each view are fused into a truncated signed distance function on sparse voxels. A depth is the mean of
-    the splats on a ray, with less weight if they are far apart. Small connected parts are removed.
+    the splats on a ray, with less weight if they are far apart. Where it is too uncertain for these voxels, larger ones
+    fill the surface. Small connected parts are removed.
 
     Args:
       model: a model of any appearance.
       cameras: the views to fuse, as pinholes: rays of a lens have no effect. None takes the model's training views.
-      resolution: number of voxels along the radius, 512 by default.
+      resolution: number of voxels along the radius; None: 512, but no voxel smaller than a pixel at the centre.
       voxel: side of a voxel in units of the model's world, instead of the resolution.
       center: [3] centre of the space to fuse, in the model's world; None is the point nearest to all optical axes.
       radius: radius of that space; None is twice the cameras' median distance from the centre.
@@ -132,26 +154,39 @@ def extract_mesh(
     common_center, common_radius = common_sphere([camera.viewmat for camera in cameras], center)
     if not common_radius:  # Cameras in one place: the centre is at the median depth of the first.
         depth = np.asarray(depths_of(renderer(cameras[0]), cameras[0]).depth)
-        middle = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
+        has_depth = (depth > 0) & (depth < NOTHING)
+        middle = float(np.median(depth[has_depth])) if has_depth.any() else 1.0
         common_center = common_center + middle * np.asarray(cameras[0].viewmat, float)[2, :3]
         common_radius = RADII * middle
     center = common_center if center is None else np.asarray(center, np.float64)
     if radius is None:
         radius = common_radius
-    if voxel is None:
-        voxel = radius / (resolution or RESOLUTION)
-    space = Space.of(center, radius, voxel, unbounded)
-    grid = BlockGrid(max_bytes)
-    for index, camera in enumerate(progress_over(cameras, "fusing", "view", is_shown=progress)):
-        try:
-            fuse(grid, depths_of(renderer(camera), camera), space)
-        except GridFullError:
-            raise GridFullError(
-                f"a resolution of {radius / voxel:.0f} voxels along the radius takes more than "
-                f"{max_bytes / 1e9:.3g} GB after {index + 1} of {len(cameras)} views: lower `resolution` or `radius`, "
-                "or raise `max_memory` (max_bytes in Python)"
-            ) from None
-    mesh, num_dropped = largest_clusters(surface_of(grid, space, least_weight), most_clusters, least_faces)
+    if voxel is None and resolution is None:
+        # Voxels smaller than pixels hold no more detail, and have holes.
+        voxel = max(radius / RESOLUTION, _pixel_at(center, cameras))
+    elif voxel is None:
+        voxel = radius / resolution
+    # A level takes at most a third of the bytes that the one before takes.
+    sides = _voxels_of_levels(voxel, radius)
+    spaces = [Space.of(center, radius, side, unbounded) for side in sides]
+    grids = [BlockGrid(int(2 / 3 * max_bytes / 3**level)) for level in range(len(sides))]
+    seen: list[np.ndarray] = []
+    try:
+        for camera in progress_over(cameras, "fusing", "view", is_shown=progress):
+            depths = depths_of(renderer(camera), camera)
+            for grid, space in zip(grids, spaces, strict=True):
+                fuse(grid, depths, space)
+            seen.append(_sampled(depths, spaces[0], MOST_SAMPLED // len(cameras)))
+        for grid, coarse in reversed([*itertools.pairwise(grids)]):
+            fill(grid, coarse, least_weight)
+    except GridFullError:
+        raise GridFullError(
+            f"a resolution of {radius / voxel:.0f} voxels along the radius takes more than {max_bytes / 1e9:.3g} GB: "
+            "lower `resolution` or `radius`, or raise `max_memory` (max_bytes in Python)"
+        ) from None
+    num_bytes = sum(grid.num_bytes for grid in grids)
+    surface = surface_of(grids[0], spaces[0], least_weight)
+    mesh, num_dropped = largest_clusters(surface, most_clusters, least_faces)
     if not mesh.num_faces:
         if num_dropped:
             raise ValueError(
@@ -162,8 +197,47 @@ def extract_mesh(
             "there is no surface within the radius around the point that the cameras look at: give a larger `radius`, "
             "or `unbounded`"
         )
+    missing = _share_missing(mesh, np.concatenate(seen), sides)
     seconds = time.perf_counter() - start
-    return MeshResult(mesh, center, radius, voxel, len(cameras), num_dropped, grid.num_bytes, seconds)
+    return MeshResult(mesh, center, radius, voxel, len(cameras), num_dropped, missing, num_bytes, seconds)
+
+
+def _voxels_of_levels(voxel: float, radius: float) -> list[float]:
+    """Return the sides of voxels of all levels, the smallest first."""
+    sides = [voxel]
+    while len(sides) < MOST_LEVELS and 2 * TRUNCATION * sides[-1] <= LONGEST_TRUNCATION * radius:
+        sides.append(2 * sides[-1])
+    return sides
+
+
+def _pixel_at(center: np.ndarray, cameras: Sequence[Camera]) -> float:
+    """Return the median size of a pixel of the cameras at a point [3], in units of the world."""
+    sizes = []
+    for camera in cameras:
+        distance = np.linalg.norm(np.asarray(camera.center, np.float64) - center)
+        sizes.append(distance / float(camera.K[0, 0]))
+    return float(np.median(sizes))
+
+
+def _sampled(depths: RenderedDepth, space: Space, num: int) -> np.ndarray:
+    """Return about `num` points with a depth in the space, [P, 4]: position, and standard deviation of the depth."""
+    points = np.asarray(back_project(depths.depth, depths.camera)).reshape(-1, 3)
+    spread = np.asarray(depths.spread).reshape(-1)
+    chosen = np.arange(0, len(points), max(1, len(points) // max(num, 1)))
+    has_depth = np.asarray(depths.depth).reshape(-1)[chosen] > 0
+    is_inside = np.asarray(space.contains(jnp.asarray(points[chosen])))
+    chosen = chosen[has_depth & is_inside]
+    return np.column_stack([points[chosen], spread[chosen]])
+
+
+def _share_missing(mesh: Mesh, seen: np.ndarray, sides: Sequence[float]) -> float:
+    """Return the share of points with standard deviations [P, 4] that have no vertex within that, or within a
+    truncation of the smallest voxels; beyond a truncation of the largest ones a surface is another one."""
+    if not len(seen):
+        return 0.0
+    distances, _ = cKDTree(mesh.vertices).query(seen[:, :3])
+    reach = np.clip(seen[:, 3], TRUNCATION * sides[0], TRUNCATION * sides[-1])
+    return float(np.mean(distances > reach))
 
 
 def check_lengths(resolution: int | None, voxel: float | None, radius: float | None) -> None:

@@ -27,6 +27,10 @@ LEAST_FACING = 0.1
 """Smallest cosine between a ray and a normal; smaller ones are raised to it."""
 LEAST_ALPHA = 0.5
 """Smallest alpha of a pixel that has a depth."""
+EMPTY_ALPHA = 0.1
+"""Alpha of a pixel below which nothing is on its ray."""
+NOTHING = 1e12
+"""Depth of such a pixel, beyond every space."""
 SIDE = 8
 """Voxels along a side of a block."""
 VOXELS = SIDE**3
@@ -38,6 +42,9 @@ LIMIT = 1 << 20
 """Bound of block coordinates: three of them fit into a key of 63 bits."""
 NOWHERE = -(2**31)
 """Block coordinate of pixels without a depth, out of bounds."""
+HALF = SIDE // 2
+FILLED = 1024
+"""Blocks filled from a coarser grid at a time."""
 CHUNK = 64
 """Blocks fused at a time: few, so that they stay in the cache."""
 
@@ -152,7 +159,7 @@ class RenderedDepth(NamedTuple):
     """Depths and colours of one view."""
 
     camera: Camera
-    depth: Array  # [H, W] along the camera's z axis, at pixel centres; 0 where there is none.
+    depth: Array  # [H, W] along the camera's z axis, at pixel centres; 0 where it is unknown, NOTHING on empty rays.
     spread: Array  # [H, W] standard deviation of the splats' depths, weighted as the depth is.
     slant: Array  # [H, W] in (0, 1]: distance from the surface's plane per distance along the z axis, on the ray.
     facing: Array  # [H, W] cosine between the ray and the surface's normal.
@@ -173,7 +180,13 @@ def rendered_depth(output: RenderOutput, camera: Camera) -> RenderedDepth:
     facing = jnp.maximum(slant / jnp.linalg.norm(rays, axis=-1), LEAST_FACING)
     slant = jnp.clip(slant, LEAST_FACING, 1.0)
     color = jnp.clip(jnp.nan_to_num(output.color), 0.0, 1.0)
-    return RenderedDepth(camera, jnp.where(is_opaque & (depth > 0), depth, 0.0), spread, slant, facing, color)
+    depth = jnp.where(is_opaque & (depth > 0), depth, 0.0)
+    # Where a view shows nothing, there is nothing on the ray.
+    is_empty = output.alpha < EMPTY_ALPHA
+    depth = jnp.where(is_empty, NOTHING, depth)
+    slant = jnp.where(is_empty, 1.0, slant)
+    facing = jnp.where(is_empty, 1.0, facing)
+    return RenderedDepth(camera, depth, spread, slant, facing, color)
 
 
 def fuse(grid: BlockGrid, depths: RenderedDepth, space: Space) -> None:
@@ -189,6 +202,47 @@ def fuse(grid: BlockGrid, depths: RenderedDepth, space: Space) -> None:
         for array, values in zip(arrays, fused, strict=True):
             # Without the repeated rows.
             array[chosen] = np.asarray(values)[: len(chosen)]
+
+
+def fill(grid: BlockGrid, coarse: BlockGrid, least_weight: float) -> None:
+    """Fill unknown voxels, which have at most the least weight, from a grid of voxels twice as large.
+
+    A depth that is too uncertain for small voxels may be certain enough for large ones, whose truncation is wider.
+    """
+    for start in range(0, len(grid.coordinates), FILLED):
+        rows = np.arange(start, min(start + FILLED, len(grid.coordinates)))
+        of_coarse = _interpolated(coarse, grid.coordinates[rows], least_weight)
+        is_filled = (of_coarse[..., 0] > 1 - 1e-3) & (grid.weight[rows] <= least_weight)
+        # Truncations of the coarse grid are twice as long.
+        distance = np.clip(2 * of_coarse[..., 1], -1.0, 1.0)
+        weight = of_coarse[..., 2]
+        grid.distance[rows] = np.where(is_filled, distance * weight, grid.distance[rows])
+        grid.weight[rows] = np.where(is_filled, weight, grid.weight[rows])
+        grid.color[rows] = np.where(is_filled[..., None], of_coarse[..., 3:], grid.color[rows])
+
+
+def _interpolated(coarse: BlockGrid, blocks: np.ndarray, least_weight: float) -> np.ndarray:
+    """Return [B, VOXELS, 6] at the voxels of blocks [B, 3], interpolated between voxels twice as large: the share of
+    known ones, mean distance, weight, and colour."""
+    # A fine block is half a coarse one: its voxels are between HALF + 1 coarse ones along each axis.
+    corners = np.stack(np.meshgrid(*[np.arange(HALF + 1)] * 3, indexing="ij"), -1)
+    voxels = (blocks[:, None, None, None] * HALF + corners).reshape(-1, 3)
+    of_blocks = voxels // SIDE
+    _, first, inverse = np.unique(_keys_of(of_blocks), return_index=True, return_inverse=True)
+    rows = coarse.find(of_blocks[first])[inverse]
+    x, y, z = (voxels % SIDE).T
+    local = (x * SIDE + y) * SIDE + z
+    weight = np.where(rows >= 0, coarse.weight[rows, local], 0.0)
+    is_known = weight > least_weight
+    mean = coarse.distance[rows, local] / np.where(is_known, weight, 1.0)
+    values = np.column_stack([is_known, mean, weight, coarse.color[rows, local]]).astype(np.float32)
+    values *= is_known[:, None]
+    values = values.reshape(len(blocks), *corners.shape[:3], -1)
+    places = np.arange(SIDE) / 2
+    share = np.maximum(0.0, 1.0 - np.abs(places[:, None] - np.arange(HALF + 1))).astype(np.float32)
+    return np.einsum("xa,yb,zc,nabcv->nxyzv", share, share, share, values, optimize=True).reshape(
+        len(blocks), VOXELS, -1
+    )
 
 
 def _blocks_near(depths: RenderedDepth, space: Space) -> Array:
@@ -224,7 +278,9 @@ def _fused(voxels: list[Array], blocks: Array, depths: RenderedDepth, space: Spa
     signed = slant * (seen - z) / truncation
     # 1 to within a voxel behind the surface, falling to 0 at the truncation: a view does not show what is deeper.
     behind = jnp.clip((1 + signed) / (1 - 1 / TRUNCATION), 0.0, 1.0)
-    sure = facing**2 * behind / (1 + (spread / (SURE * truncation)) ** 2)
+    # Far in front of an uncertain depth, it is certain that there is nothing.
+    ahead_of = jnp.maximum(slant * (seen - z), truncation)
+    sure = facing**2 * behind / (1 + (spread / (SURE * ahead_of)) ** 2)
     # Voxels deeper than a truncation behind the surface are hidden, and unknown to this view.
     added = jnp.where(is_seen & is_ahead & (signed >= -1), sure, 0.0).reshape(-1, VOXELS)
     distance = distance + added * jnp.minimum(signed, 1.0).reshape(-1, VOXELS)

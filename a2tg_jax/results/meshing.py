@@ -17,6 +17,9 @@ from a2tg_jax.mesh.triangles import check_simplifying, simplify_mesh
 from a2tg_jax.results.model_source import Source
 from a2tg_jax.results.options import MeshOptions
 
+MUCH_MISSING = 0.05
+MANY_HOLES = ": train gaussians-2d with `preset` surfaces, or from more photographs, or give a smaller `resolution`"
+"""Advice for meshes of which more than `MUCH_MISSING` is missing."""
 GRID_SHARE = 0.5
 """Default share of the free memory for voxels."""
 
@@ -83,6 +86,8 @@ def write_mesh(
             f"fused {counted(result.num_views, 'view')} at voxels of {result.voxel / scale:.3g}, within "
             f"{result.radius / scale:.3g} of the centre ({in_bytes(result.num_bytes)} of voxels)",
             f"left out {counted(result.num_dropped, 'small part')}",
+            f"{100 * result.missing:.0f} % of what the views show has no surface"
+            f"{MANY_HOLES if result.missing > MUCH_MISSING else ''}",
             f"mesh: {mesh.num_vertices:,} vertices, {mesh.num_faces:,} faces{texture}, {size}, "
             f"{time.perf_counter() - start:.0f} s",
             f"file: {', '.join(map(str, files))}",
