@@ -375,7 +375,7 @@ def test_the_command_writes_the_original_world(model, tmp_path, capsys):
         ("mesh . --clusters 0", "--clusters must be at least 1; got 0"),
         ("mesh . --max-memory 1000000GB", "--max-memory must be at most"),
         ("mesh cameras.npz --radius 0.1", "point that the cameras look at: give a larger --radius"),
-        ("mesh cameras.npz --voxel 4", "parts had fewer than 50 faces: raise --resolution, lower --voxel"),
+        ("mesh cameras.npz --voxel 4", "a voxel is 0.17 of the radius, which is too large to show a surface"),
         ("mesh cameras.npz --out taken.ply", "taken.ply exists; add --overwrite"),
         ("mesh taken.npz", "taken-mesh.glb exists; add --overwrite"),
         ("mesh taken.ply --out taken.ply --overwrite", "taken.ply is the model itself; choose another --out"),

@@ -41,6 +41,8 @@ RESOLUTION = 512
 """Largest default number of voxels along the radius."""
 GRID_BYTES = 4 * 10**9
 """Default memory budget of the voxels."""
+LARGEST_VOXEL = 0.125
+"""Largest voxel, in radii."""
 MOST_LEVELS = 4
 """Largest number of grids, each with voxels twice as large, from which unknown voxels of the finer ones are filled."""
 LONGEST_TRUNCATION = 0.25
@@ -55,7 +57,7 @@ LEAST_FACES = 50
 BRICK = 16
 """Blocks along a side of a brick; marching cubes run brick by brick."""
 MOST_SAMPLED = 100_000
-"""Pixels of all views at which a missing surface is looked for, about."""
+"""About how many pixels of all views are checked for a missing surface."""
 SAME = 1e-3
 """Largest distance in voxels between two bricks' copies of a shared vertex."""
 
@@ -163,9 +165,14 @@ def extract_mesh(
         radius = common_radius
     if voxel is None and resolution is None:
         # Voxels smaller than pixels hold no more detail, and have holes.
-        voxel = max(radius / RESOLUTION, _pixel_at(center, cameras))
+        voxel = min(max(radius / RESOLUTION, _pixel_at(center, cameras)), LARGEST_VOXEL * radius)
     elif voxel is None:
         voxel = radius / resolution
+    if voxel > LARGEST_VOXEL * radius:
+        raise ValueError(
+            f"a voxel is {voxel / radius:.2g} of the radius, which is too large to show a surface: raise `resolution`, "
+            f"lower `voxel` to {LARGEST_VOXEL:g} of the radius at most, or raise `radius`"
+        )
     # A level takes at most a third of the bytes that the one before takes.
     sides = _voxels_of_levels(voxel, radius)
     spaces = [Space.of(center, radius, side, unbounded) for side in sides]
