@@ -91,9 +91,9 @@ class Make:
         run_step("render", [str(run.path), "--path", "front", "--out", str(flight), "--overwrite"])
         shutil.copyfile(flight / FRONT_NAME, picture)
         origin = open_source(run.path).model.origin
-        path = "orbit" if origin is not None and unseen_angle(origin) <= SURROUNDED else "smooth"
+        route = "orbit" if origin is not None and unseen_angle(origin) <= SURROUNDED else "smooth"
         frames = ["--frames", str(NUM_FRAMES), "--out", str(flight), "--overwrite"]
-        run_step("render", [str(run.path), "--path", path, *frames])
+        run_step("render", [str(run.path), "--path", route, *frames])
         minutes, seconds = divmod(round(time.monotonic() - started), 60)
         print_now(f"made in {minutes}:{seconds:02} minutes\npage: {page}\npicture: {picture}\nflight: {flight}/")
         if self.open:

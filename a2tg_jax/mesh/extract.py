@@ -163,11 +163,11 @@ def extract_mesh(
     center = common_center if center is None else np.asarray(center, np.float64)
     if radius is None:
         radius = common_radius
-    if voxel is None and resolution is None:
+    if resolution is not None:
+        voxel = radius / resolution
+    elif voxel is None:
         # Voxels smaller than pixels hold no more detail, and have holes.
         voxel = min(max(radius / RESOLUTION, _pixel_at(center, cameras)), LARGEST_VOXEL * radius)
-    elif voxel is None:
-        voxel = radius / resolution
     if voxel > LARGEST_VOXEL * radius:
         raise ValueError(
             f"a voxel is {voxel / radius:.2g} of the radius, which is too large to show a surface: raise `resolution`, "
