@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.typing import ArrayLike, DTypeLike
-from scipy.spatial import cKDTree
 
 from a2tg_jax.base.checks import (
     FLOATS,
@@ -231,6 +230,8 @@ def init_from_points(
         colors = colors[keep]
     if len(points) < 2:
         raise ValueError(f"at least two points are needed to choose scales; got {len(points)}")
+    from scipy.spatial import cKDTree  # Not at import of the package, which would take 0.2 s longer.
+
     neighbours = min(3, len(points) - 1)
     # The nearest point of each is the point itself.
     distances = cKDTree(points).query(points, k=neighbours + 1)[0][:, 1:]

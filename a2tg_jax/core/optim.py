@@ -5,7 +5,7 @@ jaxopt has no Adam. No other module imports jaxopt.
 
 import math
 import warnings
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -17,9 +17,7 @@ from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.text import shortened
 from a2tg_jax.core.pytree import pytree
 
-with warnings.catch_warnings():
-    # jaxopt warns at import that it is no longer maintained, about which users of this package can do nothing.
-    warnings.filterwarnings("ignore", message="JAXopt is no longer maintained", category=DeprecationWarning)
+if TYPE_CHECKING:
     from jaxopt import OptStep as OptStep  # type: ignore[import-untyped]
 
 
@@ -63,7 +61,7 @@ def adam_update(
     b1: float = 0.9,
     b2: float = 0.999,
     eps: float = 1e-15,  # as in 3DGS: gradients of one Gaussian may be far below 1e-8
-) -> OptStep:
+) -> "OptStep":
     """Make one bias-corrected update of Adam (Kingma & Ba, 2015); ε is added after the correction, as in PyTorch.
 
     Args:
@@ -120,6 +118,12 @@ def adam_update(
         root = jnp.sqrt(v) / jnp.sqrt(second)
         change: Array = rate / first * (m / (root + eps))
         return param - change
+
+    with warnings.catch_warnings():
+        # jaxopt warns at import that it is no longer maintained, about which users of this package can do nothing. It
+        # is imported here because it brings SciPy's optimisers, a quarter of the time of importing this package.
+        warnings.filterwarnings("ignore", message="JAXopt is no longer maintained", category=DeprecationWarning)
+        from jaxopt import OptStep
 
     params = jax.tree.map(step, _rate_of_each(rates, params), params, mu, nu)
     return OptStep(params=params, state=AdamState(mu, nu, count))

@@ -9,7 +9,6 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from a2tg_jax.base.checks import LARGEST_NUMBER, check_array, check_kind, check_shape
 from a2tg_jax.base.even_spacing import fibonacci
@@ -108,6 +107,8 @@ def transform_gaussians(gaussians: Gaussians, similarity: Similarity) -> Gaussia
     quats = np.asarray(gaussians.quats, np.float64)
     # The renderer draws quaternions of zeros as unrotated.
     quats = np.where(quats.any(axis=1, keepdims=True), quats, [1.0, 0.0, 0.0, 0.0])
+    from scipy.spatial.transform import Rotation  # Not at import of the package, which would take 0.2 s longer.
+
     turned = Rotation.from_matrix(rotation) * Rotation.from_quat(quats, scalar_first=True)
     log_scales = np.asarray(gaussians.log_scales, np.float64) + np.log(similarity.scale)
     # D is block diagonal: lower degrees need its upper left part only.

@@ -7,7 +7,7 @@ values, and its status makes all further steps idle, so that Python may read it 
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ from jax.sharding import Mesh
 from a2tg_jax.appearance import Appearance, project_appearance
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians
-from a2tg_jax.core.optim import AdamState, OptStep, adam_update
+from a2tg_jax.core.optim import AdamState, adam_update
 from a2tg_jax.core.pytree import combine, partition, pytree
 from a2tg_jax.core.sh import SH_C0
 from a2tg_jax.events import Change, EventInfo, Now, Seen, StepEvent, read_probe
@@ -37,6 +37,9 @@ from a2tg_jax.training.gradients import TracedView, differentiate
 from a2tg_jax.training.returned import calling, check_kept, check_scalar, checked_change
 from a2tg_jax.training.stage import Background, Clock, Stage
 from a2tg_jax.training.terms import Target
+
+if TYPE_CHECKING:
+    from a2tg_jax.core.optim import OptStep
 
 FINE, OVERFLOW, NOT_FINITE, IMPOSSIBLE, EXPLODED = range(5)
 """Status of a state: the reason why the last step was not taken."""
@@ -325,7 +328,7 @@ def batch_gradients(
     return with_rows_of_views_divided(settings.mesh, views)
 
 
-def optimized(stage: Stage, state: TrainState, grads: Any, rate_of_means: Array, progress: Array) -> OptStep:
+def optimized(stage: Stage, state: TrainState, grads: Any, rate_of_means: Array, progress: Array) -> "OptStep":
     """Return the model's floats and their moments after Adam, given the gradients of the Gaussians and of the floats of
     their appearance, the present rate of the means, and the share of the stage that is done."""
     floats, _ = partition(state.model)
