@@ -264,8 +264,8 @@ def test_large_voxels_fill_what_small_ones_do_not_know():
     assert len(half_of(surface_of(grids[0], spaces[0], least))) == 0
     known = grids[0].distance.copy()
     is_known = grids[0].weight > least
-    fill(grids[1], grids[2], least)
-    fill(grids[0], grids[1], least)
+    fill(grids[1], grids[2], least, least)
+    fill(grids[0], grids[1], least, least)
     np.testing.assert_array_equal(grids[0].distance[is_known], known[is_known])
     filled = half_of(surface_of(grids[0], spaces[0], least))
     assert np.abs(np.linalg.norm(filled, axis=1) - RADIUS).max() < 2 * voxel

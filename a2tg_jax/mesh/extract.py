@@ -1,7 +1,6 @@
 """Mesh extraction from a model: depths of views, their fusion, marching cubes, and cleaning (host)."""
 
 import dataclasses
-import itertools
 import time
 from collections.abc import Iterator, Sequence
 
@@ -50,6 +49,8 @@ LONGEST_TRUNCATION = 0.25
 RADII = 2.0
 """Default radius, in median distances of the cameras from the centre."""
 LEAST_WEIGHT = 0.05
+LEAST_TO_FILL = 0.3
+"""Larger voxels up to this weight do not fill smaller ones: their surface would be less accurate than none."""
 MOST_CLUSTERS = 50
 """Default number of connected parts to keep, as in 2DGS."""
 LEAST_FACES = 50
@@ -184,8 +185,9 @@ def extract_mesh(
             for grid, space in zip(grids, spaces, strict=True):
                 fuse(grid, depths, space)
             seen.append(_sampled(depths, spaces[0], MOST_SAMPLED // len(cameras)))
-        for grid, coarse in reversed([*itertools.pairwise(grids)]):
-            fill(grid, coarse, least_weight)
+        least_weights = [least_weight, *[max(least_weight, LEAST_TO_FILL)] * (len(grids) - 1)]
+        for level in reversed(range(len(grids) - 1)):
+            fill(grids[level], grids[level + 1], *least_weights[level : level + 2])
     except GridFullError:
         raise GridFullError(
             f"a resolution of {radius / voxel:.0f} voxels along the radius takes more than {max_bytes / 1e9:.3g} GB: "

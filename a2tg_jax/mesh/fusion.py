@@ -204,14 +204,14 @@ def fuse(grid: BlockGrid, depths: RenderedDepth, space: Space) -> None:
             array[chosen] = np.asarray(values)[: len(chosen)]
 
 
-def fill(grid: BlockGrid, coarse: BlockGrid, least_weight: float) -> None:
-    """Fill unknown voxels, which have at most the least weight, from a grid of voxels twice as large.
+def fill(grid: BlockGrid, coarse: BlockGrid, least_weight: float, least_of_coarse: float) -> None:
+    """Fill unknown voxels from a grid of voxels twice as large. A voxel is unknown up to the least weight of its grid.
 
     A depth that is too uncertain for small voxels may be certain enough for large ones, whose truncation is wider.
     """
     for start in range(0, len(grid.coordinates), FILLED):
         rows = np.arange(start, min(start + FILLED, len(grid.coordinates)))
-        of_coarse = _interpolated(coarse, grid.coordinates[rows], least_weight)
+        of_coarse = _interpolated(coarse, grid.coordinates[rows], least_of_coarse)
         is_filled = (of_coarse[..., 0] > 1 - 1e-3) & (grid.weight[rows] <= least_weight)
         # Truncations of the coarse grid are twice as long.
         distance = np.clip(2 * of_coarse[..., 1], -1.0, 1.0)
