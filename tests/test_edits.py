@@ -100,6 +100,7 @@ def test_the_viewers_file_has_the_same_scores_and_the_vertical():
     cameras = (model.origin.viewmats, model.origin.Ks, model.origin.sizes)
     np.testing.assert_array_equal(np.sort(np.concatenate(scores)), np.sort(floater_scores(*numbers, *cameras)))
     assert header["origin"]["up"] == [0.0, 0.6, 0.8]
+    assert header["page"]["subject"].startswith("no subject: it follows from what at least 3 cameras look at")
     assert model_in(data).origin == model.origin
 
 
@@ -181,6 +182,7 @@ def test_flags_of_edits_are_checked(options, message):
         ({"crop": [1]}, "crop must be an object"),
         ({"crop": {"low": [1, 2], "high": [None] * 3}}, "crop.low must be 3 finite numbers or null"),
         ({"crop": {"axes": [[1, 0, 0]] * 3, "low": [0] * 3, "high": [1] * 3}}, "crop.axes must have a rotation"),
+        ({"subject": 1}, "subject must be true or false; got 1"),
         ({"up": [0, 0, 0]}, "up must not be zero"),
         ({"background": [1, 2, None]}, "background must be 3 finite numbers"),
         ({"crops": {}}, "has the unknown entry crops"),

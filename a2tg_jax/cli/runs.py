@@ -383,13 +383,14 @@ class Convert:
 
 @dataclasses.dataclass(frozen=True)
 class EditCommand:
-    """Crop and turn a model, remove floaters and set the background, without a browser.
+    """Crop and turn a model, remove floaters or all but the subject, and set the background, without a browser.
 
     --out is an edit for --edit of other commands, as a2tg view saves it (*.json), or the edited model in any format of
     a2tg convert.
 
     Examples:
       a2tg edit runs/fox --out fox.sog --crop 35:65 35:65 0:100 --floaters 40
+      a2tg edit runs/toy --out toy.glb --subject
       a2tg edit runs/fox --out edit.json --upright IMG_0012.jpg --background white
     """
 

@@ -11,6 +11,7 @@ import os
 import struct
 import zlib
 from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 from typing import Any, Self
 
 import numpy as np
@@ -66,8 +67,9 @@ ORIGIN_DTYPES = {
 }  # fmt: skip
 COLORED = {"sh_0", "sh_1", "sh_2", "sh_3", "texel_colors"}
 """Names of the parts whose columns are red, green and blue."""
-FLOATERS = "floaters"
-"""Name of the parts with the scores of floaters, which only files for browsers have."""
+MARKS = ("floaters", "subject")
+"""Names of the parts with a byte a row, which only files for browsers have: scores of floaters, and 1 for the
+subject."""
 LARGEST_CHUNK = 16384
 LEAST_CHUNK = 256
 """Limits of the number of rows in a chunk of a file for browsers."""
@@ -190,7 +192,7 @@ def encode_model(
     *,
     order: np.ndarray | None = None,
     page: Mapping[str, object] | None = None,
-    floaters: np.ndarray | None = None,
+    marks: Mapping[str, np.ndarray] = MappingProxyType({}),
 ) -> bytes:
     """Return the bytes that `save_compact` writes. Raises the same errors.
 
@@ -200,7 +202,7 @@ def encode_model(
       grids: as in `save_compact` (`grids_of`); numbers beyond their ends are clipped.
       order: indices [N] of existing rows, for chunks that are drawn as they arrive; None for a single chunk.
       page: header entry for the viewer.
-      floaters: `floater_scores` of the rows that exist, which the viewer compares with a limit.
+      marks: bytes [N] of the rows that exist, for the viewer, by names of `MARKS`.
     """
     choices.check()
     check_encodable(model.appearance)
@@ -265,8 +267,9 @@ def encode_model(
                 writer.indices("sizes", np.searchsorted(table, wanted), len(table))
             for name, values in _columns(part, choices):
                 writer.numbers(name, values, choices.of_part(name), is_color=name in COLORED)
-            if floaters is not None:
-                writer.planes(FLOATERS, floaters[order[places]][None])
+            for name in MARKS:
+                if name in marks:
+                    writer.planes(name, marks[name][order[places]][None])
         return framed(header | {"parts": writer.parts, "ends": writer.ends}, writer.body), writer.num_unpacked
 
     data, num_unpacked = encoded(choices.coder)
@@ -317,13 +320,14 @@ def decode_model(data: bytes, where: str = "the compact scene") -> Model:
         check_int("num", num, 0)
         chunk = header.get("chunk", max(num, 1))
         check_int("chunk", chunk, 1)
-        has_floaters = any(name == FLOATERS for name, *_ in header["parts"])
+        found = {name for name, *_ in header["parts"]}
         parts = []
         for start in range(0, max(num, 1), chunk):
             length = min(chunk, num - start)
             parts.append(_rows_of(reader, length, header, choices, appearance))
-            if has_floaters:
-                reader.planes(FLOATERS, 1, length)  # They follow from the rows.
+            for name in MARKS:
+                if name in found:
+                    reader.planes(name, 1, length)  # They follow from the rows.
         origin = None
         if "origin" in header:
             arrays = {}

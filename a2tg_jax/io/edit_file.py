@@ -18,6 +18,7 @@ from a2tg_jax.core.similarity import check_similarity
 from a2tg_jax.io.columns import AxisSteps
 from a2tg_jax.io.floaters import floater_scores
 from a2tg_jax.io.saved_file import VERSION, load_saved
+from a2tg_jax.io.subject import find_subject
 
 # As in web/src/extent.ts.
 PERCENTILES_PER_SPREAD = 1.2
@@ -50,6 +51,8 @@ class Edit(NamedFields):
     """[3] unit vertical."""
     background: Color | None = None
     """RGB in [0, 1] behind all splats."""
+    subject: bool = False
+    """Whether only the subject is kept: what the cameras look at, without its floor and background."""
 
 
 def load_edit(path: Path) -> Edit:
@@ -78,6 +81,8 @@ def save_edit(path: Path, edit: Edit) -> None:
             changes["crop"][name] = [end if math.isfinite(end) else None for end in ends.tolist()]
     if edit.floaters:
         changes["floaters"] = edit.floaters
+    if edit.subject:
+        changes["subject"] = True
     if edit.up is not None:
         changes["up"] = edit.up.tolist()
     if edit.background is not None:
@@ -107,12 +112,15 @@ def crop_box(model: Model, up: np.ndarray, low: np.ndarray, high: np.ndarray) ->
 
 
 def _edit_of(data: dict[str, Any]) -> Edit:
-    unknown = sorted(set(data) - {"format", "version", "crop", "floaters", "up", "background"})
+    unknown = sorted(set(data) - {"format", "version", "crop", "floaters", "subject", "up", "background"})
     if unknown:
         raise ValueError(f"has the unknown entry {shortened(unknown[0])}")
     floaters = data.get("floaters", 0.0)
     if type(floaters) not in (int, float) or not 0 <= floaters <= 1:
         raise ValueError(f"floaters must be a number from 0 to 1; got {shortened(repr(floaters))}")
+    subject = data.get("subject", False)
+    if type(subject) is not bool:
+        raise ValueError(f"subject must be true or false; got {shortened(repr(subject))}")
     crop = data.get("crop")
     if crop is not None:
         crop = _box_of(crop)
@@ -126,7 +134,7 @@ def _edit_of(data: dict[str, Any]) -> Edit:
     if background is not None:
         red, green, blue = number_array(background, 3, "background").tolist()
         background = (red, green, blue)
-    return Edit(crop, float(floaters), up, background)
+    return Edit(crop, float(floaters), up, background, subject)
 
 
 def _box_of(crop: object) -> Box:
@@ -151,8 +159,8 @@ def scores_of(model: Model) -> np.ndarray:
 
 
 def apply_edit(model: Model, edit: Edit) -> Model:
-    """Return an edited model: without the Gaussians outside the box and the floaters, with another vertical and
-    background (host).
+    """Return an edited model: without the Gaussians outside the box, the floaters and what is around the subject, with
+    another vertical and background (host).
 
     The vertical changes no number of the model. Files of other programs, meshes, orbits and the viewer are upright by
     it.
@@ -165,12 +173,14 @@ def apply_edit(model: Model, edit: Edit) -> Model:
       The changed model.
 
     Raises:
-      ValueError: if no Gaussian would be left.
+      ValueError: if no Gaussian would be left, or the model has no subject.
     """
     model = model.live
     is_kept = np.ones(model.num, bool)
     if edit.floaters > 0:
         is_kept &= scores_of(model) <= largest_score(edit.floaters)
+    if edit.subject:
+        is_kept &= find_subject(model).is_kept
     if edit.crop is not None:
         places = np.asarray(model.gaussians.means, np.float64) @ edit.crop.axes.T
         is_kept &= ((places >= edit.crop.low) & (places <= edit.crop.high)).all(axis=1)

@@ -1,4 +1,4 @@
-"""Edits without the viewer: crop, floaters, vertical and background from options, as the viewer saves them."""
+"""Edits without the viewer: crop, floaters, subject, vertical and background from options, as the viewer saves them."""
 
 import re
 import time
@@ -11,6 +11,7 @@ from a2tg_jax import Model, Origin
 from a2tg_jax.base.text import did_you_mean
 from a2tg_jax.core.origin import Color
 from a2tg_jax.io.edit_file import Edit, apply_edit, crop_box, save_edit
+from a2tg_jax.io.subject import find_subject
 from a2tg_jax.results.conversion import check_conversion, write_converted
 from a2tg_jax.results.model_source import open_source
 from a2tg_jax.results.options import EditOptions, PlacementOptions
@@ -24,7 +25,7 @@ AXES |= {f"-{name}": -axis for name, axis in AXES.items()}
 def edit_of(options: EditOptions, model: Model) -> Edit:
     """Return the edit of a model. Raises ValueError, naming the option, if one is invalid or none is given."""
     if options == EditOptions():
-        raise ValueError("nothing to change: give `crop`, `floaters`, `upright` or `background`")
+        raise ValueError("nothing to change: give `crop`, `floaters`, `subject`, `upright` or `background`")
     if not 0 <= options.floaters <= 100:
         raise ValueError(f"`floaters` must be a percentage from 0 to 100; got {options.floaters:g}")
     up = None if options.upright is None else _vertical(options.upright, model)
@@ -34,7 +35,8 @@ def edit_of(options: EditOptions, model: Model) -> Edit:
         # Like the sliders, upright by the vertical that the edit leads to.
         vertical = _origin_of(model).vertical if up is None else up
         crop = crop_box(model, vertical, low, high)
-    return Edit(crop, options.floaters / 100, up, None if options.background is None else _color(options.background))
+    background = None if options.background is None else _color(options.background)
+    return Edit(crop, options.floaters / 100, up, background, options.subject)
 
 
 def write_edit(
@@ -52,10 +54,12 @@ def write_edit(
     opened = open_source(source, name)
     edit = edit_of(options, opened.model)
     edited = apply_edit(opened.model, edit)
+    note = f"\nsubject: {find_subject(opened.model).words}" if edit.subject else ""
     if not is_edit:
-        return write_converted(opened.path, edited, out, start, PlacementOptions())
+        return write_converted(opened.path, edited, out, start, PlacementOptions()) + note
     save_edit(out, edit)
-    return f"{out}: an edit that keeps {edited.num:,} of {opened.model.num:,} Gaussians; --edit {out} applies it"
+    kept = f"{edited.num:,} of {opened.model.num:,} Gaussians"
+    return f"{out}: an edit that keeps {kept}; --edit {out} applies it{note}"
 
 
 def _shares(text: str) -> tuple[float, float]:

@@ -102,6 +102,9 @@ class EditOptions:
     of the scene, and 0 and 100 cut nothing. Such as 35:65 35:65 0:100."""
     floaters: float = 0.0
     """Strictness in percent with which floaters are removed; 0 removes none."""
+    subject: bool = False
+    """Keep only what the cameras look at, without its floor and background. The command prints
+    how sure that is."""
     upright: str | None = None
     """The vertical: the name of a photograph that was held level, or an axis of the original world that is up, such as
     y; write --upright=-y for one with a minus."""

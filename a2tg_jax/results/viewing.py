@@ -182,7 +182,8 @@ class LiveView:
 
     def _encode(self, model: Model, began: float) -> None:
         try:
-            encoded = encode_web_scene(model, title=self._title, coder="none")  # Viewed once, on this machine.
+            # Viewed once, on this machine.
+            encoded = encode_web_scene(model, title=self._title, coder="none", finds_subject=False)
             with self._lock:
                 self._scene_bytes = encoded
                 self._status |= {"version": self._status["version"] + 1, "message": ""}

@@ -142,6 +142,37 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     await page.close();
   });
 
+  test("handles in the scene move the box by keys and pointer, and edits are taken back and made again", async () => {
+    const page = await opened(DESK);
+    expect(await page.isVisible("#box")).toBe(false);
+    expect([await page.isDisabled("#undo"), await page.isDisabled("#alone")]).toEqual([true, true]);
+    await page.click("#cropping > summary");
+    const handle = page.locator('#box circle[aria-label="Width, from, of the box"]');
+    await handle.focus();
+    await page.keyboard.press("ArrowRight");
+    expect(Number(await page.inputValue("#from-width"))).toBeCloseTo(0.01, 9);
+    await page.keyboard.press("Control+z");
+    expect(await page.inputValue("#from-width")).toBe("0");
+    await page.keyboard.press("Control+Shift+z");
+    expect(Number(await page.inputValue("#from-width"))).toBeCloseTo(0.01, 9);
+    const before = await handle.boundingBox();
+    const [x, y] = [(before?.x ?? NaN) + 8, (before?.y ?? NaN) + 8];
+    await page.mouse.move(x, y);
+    await page.mouse.down();
+    await page.mouse.move(x + 40, y, { steps: 4 });
+    await page.mouse.up();
+    const moved = Number(await page.inputValue("#from-width"));
+    expect(moved).toBeGreaterThan(0.05);
+    await page.click("#undo");
+    expect(Number(await page.inputValue("#from-width"))).toBeCloseTo(0.01, 9);
+    await page.click("#redo");
+    expect(Number(await page.inputValue("#from-width"))).toBe(moved);
+    await page.click("#uncrop");
+    await page.keyboard.press("Control+z");
+    expect(Number(await page.inputValue("#from-width"))).toBe(moved);
+    await page.close();
+  });
+
   test("sliders set the lens and the exposure, and the address keeps them", async () => {
     const page = await opened(DESK);
     expect(await page.isHidden("#fly")).toBe(true); // It takes two cameras.

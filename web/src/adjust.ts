@@ -3,9 +3,10 @@
 import type { Lens } from "./camera";
 import { colorOf, hexOf } from "./edit";
 import { WHOLE } from "./extent";
+import type { Crop } from "./extent";
 import type { Header } from "./format";
 import type { Vec3 } from "./math";
-import { element } from "./page";
+import { element, setText } from "./page";
 import { rollOf, rolled, verticalIn } from "./vertical";
 import type { Viewer } from "./viewer";
 
@@ -28,7 +29,6 @@ export class LevelControls {
       viewer.exposure = Number(this.exposure.value);
       viewer.onMove();
     });
-    viewer.onFrame = () => this.tell();
   }
 
   /** Roll the view upright. */
@@ -57,7 +57,8 @@ export class LevelControls {
     viewer.onMove();
   }
 
-  private tell(): void {
+  /** Show what the view has. */
+  tell(): void {
     const { image, exposure } = this.viewer;
     element("angle-value", HTMLOutputElement).value = `${(angleOf(image) * DEGREES).toFixed(0)}°`;
     element("exposure-value", HTMLOutputElement).value = exposure.toFixed(1);
@@ -69,7 +70,7 @@ export class LevelControls {
 
 const angleOf = ({ fx, fy, width, height }: Lens): number => 2 * Math.atan(Math.max(width / fx, height / fy) / 2);
 
-/** Sliders of the crop box and of the floaters, and the background. */
+/** Sliders of the crop box and of the floaters, the subject alone, and the background. */
 export class CropControls {
   /** Handler called when the user has changed something. */
   onChange: () => void = () => undefined;
@@ -80,6 +81,7 @@ export class CropControls {
   private readonly ranges = ["width-range", "depth-range", "height-range"].map((id) => element(id, HTMLOutputElement));
   private readonly strictness = element("floaters-value", HTMLOutputElement);
   private readonly background = element("background", HTMLInputElement);
+  private readonly alone = element("alone", HTMLButtonElement);
 
   constructor(viewer: Viewer) {
     this.viewer = viewer;
@@ -88,6 +90,11 @@ export class CropControls {
       slider.addEventListener("input", () => this.apply());
     }
     element("uncrop", HTMLButtonElement).addEventListener("click", () => this.reset());
+    this.alone.addEventListener("click", () => {
+      viewer.isAlone = !viewer.isAlone;
+      this.tell();
+      this.changed();
+    });
     this.background.addEventListener("input", () => {
       viewer.background = colorOf(this.background.value);
       this.changed();
@@ -97,6 +104,8 @@ export class CropControls {
   /** Show what a new scene has. */
   begin(header: Header): void {
     this.floaters.disabled = !header.hasFloaters;
+    this.alone.disabled = !header.hasSubject;
+    setText("subject", header.subject);
     this.show(header);
   }
 
@@ -110,9 +119,16 @@ export class CropControls {
     this.tell();
   }
 
+  /** Crop to another box. */
+  set(crop: Crop): void {
+    this.viewer.crop = crop;
+    if (this.viewer.splats !== null) this.show(this.viewer.splats.header);
+    this.changed();
+  }
+
   private reset(): void {
     const { viewer } = this;
-    [viewer.crop, viewer.floaters] = [WHOLE, 0];
+    [viewer.crop, viewer.floaters, viewer.isAlone] = [WHOLE, 0, false];
     if (viewer.splats !== null) this.show(viewer.splats.header);
     this.changed();
   }
@@ -136,6 +152,7 @@ export class CropControls {
       output.value = `${percentOf(this.from[k])} to ${percentOf(this.to[k])} %`;
     }
     this.strictness.value = `${percentOf(this.floaters)} %`;
+    this.alone.setAttribute("aria-pressed", String(this.viewer.isAlone));
   }
 }
 

@@ -1,7 +1,7 @@
 /** Chunks of consecutive rows, read from the parts of a file. */
 
 import { at, joined } from "./arrays";
-import { FLOATERS, damaged } from "./format";
+import { FLOATERS, SUBJECT, damaged } from "./format";
 import type { Header, Quantity } from "./format";
 import type { PartReader } from "./parts";
 
@@ -22,6 +22,8 @@ export interface Chunk {
   readonly shapes: Uint8Array;
   /** [n] scores of floaters; zeros without them. */
   readonly floaters: Uint8Array;
+  /** [n] 1 for splats of the subject, else 0. */
+  readonly subject: Uint8Array;
   /** Band l ≥ 1 at index l − 1: [3, 2l + 1, m] red − green, green, blue − green of the m rows of degree ≥ l. */
   readonly bands: readonly Uint8Array[];
   /** [4, t]: red − green, green, blue − green, alpha. */
@@ -59,6 +61,7 @@ export async function readChunk(parts: PartReader, header: Header, start: number
     header.sizes === null ? [] : [await codes("texel_colors", 3, numTexels), await codes("texel_alphas", 1, numTexels)];
   const shapes = header.hasShapes ? await codes("shapes", 1, num) : new Uint8Array(num);
   const floaters = header.hasFloaters ? await parts.planes(FLOATERS, 1, num) : new Uint8Array(num);
+  const subject = header.hasSubject ? await parts.planes(SUBJECT, 1, num) : new Uint8Array(num);
   return {
     start,
     num,
@@ -68,6 +71,7 @@ export async function readChunk(parts: PartReader, header: Header, start: number
     sizes,
     shapes,
     floaters,
+    subject,
     bands,
     texels: joined(texels),
   };

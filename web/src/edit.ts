@@ -21,6 +21,7 @@ export function textOfEdit({ clip, floaters, up, background }: Edit): string | n
   const changes = {
     ...(isCropped ? { crop: { axes: clip.axes, low, high } } : {}),
     ...(floaters > 0 ? { floaters } : {}),
+    ...(clip.isAlone ? { subject: true } : {}),
     ...(up === null ? {} : { up }),
     ...(background === null ? {} : { background }),
   };

@@ -11,6 +11,8 @@ export const VERSION = 3;
 export const HEAD_BYTES = 22;
 /** Name of the parts with the scores of floaters. */
 export const FLOATERS = "floaters";
+/** Name of the parts that mark the splats of the subject. */
+export const SUBJECT = "subject";
 const MOST_ROWS = 1 << 24;
 const LARGEST_HEADER = 1 << 24;
 const LARGEST_RATIO = 64;
@@ -78,6 +80,9 @@ export interface FileHeader {
   /** Whether kernels differ in shape. */
   readonly hasShapes: boolean;
   readonly hasFloaters: boolean;
+  readonly hasSubject: boolean;
+  /** How sure the subject is, or why there is none; empty if it was not looked for. */
+  readonly subject: string;
   readonly nearPlane: number;
   readonly maxAlpha: number;
   /** Half the side of a texture, in standard deviations. */
@@ -158,6 +163,8 @@ export function parseHeader(text: Uint8Array, head: Head): FileHeader {
     numTexels,
     hasShapes: kinds.has("exponents"),
     hasFloaters: parts.some(({ name }) => name === FLOATERS),
+    hasSubject: parts.some(({ name }) => name === SUBJECT),
+    subject: page?.has("subject") === true ? page.text("subject") : "",
     nearPlane: page?.between("near_plane", 0, 1e9) ?? NEAR_PLANE,
     maxAlpha: own?.between("max_alpha", 0, 1) ?? MAX_ALPHA,
     extent: texture?.has("extent") === true ? texture.between("extent", 0, 1e9) : EXTENT,
@@ -179,7 +186,8 @@ export function parseHeader(text: Uint8Array, head: Head): FileHeader {
     texture.oneOf("alpha", ["projected"]);
   }
   // Bytes of all numbers, so that memory for them is allocated for files only that can hold them.
-  const perRow = Math.ceil((3 * header.meanBits) / 8) + 9 + Number(header.hasShapes) + Number(header.hasFloaters);
+  const numMarks = Number(header.hasShapes) + Number(header.hasFloaters) + Number(header.hasSubject);
+  const perRow = Math.ceil((3 * header.meanBits) / 8) + 9 + numMarks;
   const coefficients = degreeCounts.reduce((sum, count, i) => sum + count * ((at(degrees, i) + 1) ** 2 - 1), 0);
   const leastBytes = perRow * num + 3 * coefficients + 4 * numTexels + 204 * (names?.length ?? 0);
   if (numTexels > MOST_ROWS || leastBytes > header.room) throw damaged("its header claims more rows than bytes");

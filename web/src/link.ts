@@ -17,6 +17,8 @@ export interface View {
   readonly up: Vec3 | null;
   readonly crop: Crop;
   readonly floaters: number;
+  /** Whether only the subject is shown. */
+  readonly isAlone: boolean;
   /** The background; null if it is the scene's. */
   readonly background: Vec3 | null;
   readonly exposure: number;
@@ -50,6 +52,7 @@ export function linkOf({ pose, lens, mode, fit, up, crop, floaters, ...rest }: V
   if (up !== null) fields.push(`up=${textOf(up)}`);
   if (isCropped(crop)) fields.push(`crop=${textOf([...crop.from, ...crop.to])}`);
   if (floaters > 0) fields.push(`floaters=${textOf([floaters])}`);
+  if (rest.isAlone) fields.push("subject=yes");
   if (rest.background !== null) fields.push(`background=${textOf(rest.background)}`);
   if (rest.exposure !== 0) fields.push(`exposure=${textOf([rest.exposure])}`);
   if (rest.isFlying) fields.push("fly=yes");
@@ -80,6 +83,7 @@ export function viewOf(hash: string): View | null {
     up: isVector<Vec3>(up, 3) ? normalize(up) : null,
     crop: cropOf(fields.get("crop")),
     floaters: sharesOf(fields.get("floaters"), 1)?.[0] ?? 0,
+    isAlone: fields.get("subject") === "yes",
     background: sharesOf<Vec3>(fields.get("background"), 3),
     exposure: Math.min(Math.max(Number(fields.get("exposure")) || 0, -3), 3),
     isFlying: fields.get("fly") === "yes",

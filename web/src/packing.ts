@@ -2,8 +2,8 @@
  * Repacking of chunks for the shader. Each row takes 32 bytes, two texels of four 32-bit words:
  *
  *     x, y, z as floats | degree 0: red, green, blue; shape of the kernel
- *     quaternion x, y, z; opacity | log-scale u, v; Tu + 32 Tv + 1024 degree | first texel of its texture; score of
- *     floaters, highest | first word of its harmonics
+ *     quaternion x, y, z; opacity | log-scale u, v; Tu + 32 Tv + 1024 degree + 4096 subject | first texel of its
+ *     texture; score of floaters, highest | first word of its harmonics
  *
  * Each coefficient above degree 0 takes one word (red, green, blue, unused), padded to groups of four. Each texel takes
  * four words, so that one fetch reads all that an interpolation needs: itself, its right neighbour, the one below, and
@@ -13,6 +13,8 @@
 import type { Chunk } from "./chunks";
 
 export const ROW_WORDS = 8;
+/** Bit of the sixth word of a row that marks the subject. */
+export const SUBJECT_BIT = 1 << 28;
 /** Number of groups of four words for the coefficients above degree 0, by degree. */
 export const HARMONIC_TEXELS = [0, 1, 2, 4] as const;
 const COEFFICIENTS = [0, 3, 8, 15] as const;
@@ -37,7 +39,7 @@ export class Packer {
   pack(chunk: Chunk): Packed {
     const rows = new Uint32Array(ROW_WORDS * chunk.num);
     const floats = new Float32Array(rows.buffer);
-    const { num, means, numbers, degrees, sizes, shapes, floaters } = chunk;
+    const { num, means, numbers, degrees, sizes, shapes, floaters, subject } = chunk;
     let texel = this.numTexels;
     let harmonic = this.numHarmonics;
     for (let i = 0; i < num; i++) {
@@ -47,7 +49,7 @@ export class Packer {
       floats.set(means.subarray(3 * i, 3 * i + 3), place);
       rows[place + 3] = word(byte(6) + green, green, byte(8) + green, shapes[i]!);
       rows[place + 4] = word(byte(2), byte(3), byte(4), byte(5));
-      const packed = sizes[num + i]! | (sizes[i]! << 5) | (degrees[i]! << 10);
+      const packed = sizes[num + i]! | (sizes[i]! << 5) | (degrees[i]! << 10) | ((subject[i]! & 1) << 12);
       rows[place + 5] = word(byte(0), byte(1), packed, packed >> 8);
       rows[place + 6] = (texel & 0xffffff) | (floaters[i]! << 24);
       rows[place + 7] = harmonic;

@@ -1,13 +1,16 @@
 /** The side panel: display mode, cameras and their photographs, link, path. */
 
 import { CropControls, LevelControls } from "./adjust";
+import { BoxHandles } from "./box";
 import { intrinsicsOf, viewmatOf } from "./camera";
 import type { Intrinsics, Viewmat } from "./camera";
 import { textOfEdit } from "./edit";
+import type { Crop } from "./extent";
 import { Flight } from "./flight";
 import type { Header } from "./format";
+import { History } from "./history";
 import { hasPanel, linkOf, viewOf } from "./link";
-import type { Vec2 } from "./math";
+import type { Vec2, Vec3 } from "./math";
 import { element, setText } from "./page";
 import { MODES } from "./shaders";
 import type { Mode } from "./shaders";
@@ -28,6 +31,15 @@ interface KeptView {
   readonly size: Vec2;
 }
 
+/** What "Save edit" saves, and can be taken back. */
+interface EditState {
+  readonly crop: Crop;
+  readonly floaters: number;
+  readonly isAlone: boolean;
+  readonly up: Vec3 | null;
+  readonly background: Vec3 | null;
+}
+
 export class Panel {
   private readonly viewer: Viewer;
   private readonly mode = element("mode", HTMLSelectElement);
@@ -45,6 +57,7 @@ export class Panel {
   private readonly leveling: LevelControls;
   private readonly cropping: CropControls;
   private readonly flight: Flight;
+  private history: History<EditState>;
 
   constructor(viewer: Viewer) {
     this.viewer = viewer;
@@ -68,6 +81,17 @@ export class Panel {
     this.leveling = new LevelControls(viewer);
     this.cropping = new CropControls(viewer);
     this.cropping.onChange = () => this.noteLink();
+    const box = new BoxHandles(viewer);
+    box.onCrop = (crop) => this.cropping.set(crop);
+    viewer.onFrame = () => {
+      this.leveling.tell();
+      box.place();
+    };
+    this.history = new History(this.state);
+    this.onClick("undo", () => this.restore(this.history.undo()));
+    this.onClick("redo", () => this.restore(this.history.redo()));
+    // A drag of a slider is one change, at its end.
+    for (const kind of ["change", "click", "pointerup", "keyup"]) addEventListener(kind, () => this.remember());
     this.flight = new Flight(viewer);
     this.flight.onChange = () => this.leave();
     viewer.onLeave = () => this.leave();
@@ -101,6 +125,8 @@ export class Panel {
   /** Go to the view in the address, or to the camera that shows the front. */
   ready(): void {
     if (!this.followLink()) this.restart();
+    this.history = new History(this.state);
+    this.remember();
   }
 
   /** Set which cameras have a photograph next to the page. */
@@ -205,11 +231,9 @@ export class Panel {
   }
 
   private get link(): string {
-    const { pose, image, mode, fit, up, isUpChosen, crop, floaters } = this.viewer;
-    const { background, exposure } = this.viewer;
+    const { pose, image, mode, fit, exposure } = this.viewer;
     const { isOn: isFlying } = this.flight;
-    const edits = { up: isUpChosen ? up : null, crop, floaters, background, exposure };
-    return linkOf({ pose, lens: image, mode, fit, ...edits, isFlying, hasPanel: this.isShown });
+    return linkOf({ pose, lens: image, mode, fit, ...this.state, exposure, isFlying, hasPanel: this.isShown });
   }
 
   private async copyLink(): Promise<void> {
@@ -235,6 +259,7 @@ export class Panel {
     [viewer.pose, viewer.image, viewer.fit] = [view.pose, view.lens, view.fit];
     if (view.up !== null) viewer.chooseUp(view.up);
     [viewer.crop, viewer.floaters, viewer.background] = [view.crop, view.floaters, view.background];
+    viewer.isAlone = view.isAlone;
     viewer.exposure = view.exposure;
     if (this.header !== null) this.cropping.show(this.header);
     this.setMode(view.mode);
@@ -256,10 +281,31 @@ export class Panel {
     this.tellKept();
   }
 
+  private get state(): EditState {
+    const { crop, floaters, isAlone, up, isUpChosen, background } = this.viewer;
+    return { crop, floaters, isAlone, up: isUpChosen ? up : null, background };
+  }
+
+  private remember(): void {
+    this.history.add(this.state);
+    element("undo", HTMLButtonElement).disabled = !this.history.canUndo;
+    element("redo", HTMLButtonElement).disabled = !this.history.canRedo;
+  }
+
+  private restore(state: EditState | null): void {
+    if (state === null || this.header === null) return;
+    const { viewer } = this;
+    [viewer.crop, viewer.floaters, viewer.isAlone] = [state.crop, state.floaters, state.isAlone];
+    viewer.background = state.background;
+    viewer.chooseUp(state.up);
+    this.cropping.show(this.header);
+    this.remember();
+    this.noteLink();
+  }
+
   /** Text of what was changed; null if nothing was. */
   private get edit(): string | null {
-    const { clip, floaters, up, isUpChosen, background } = this.viewer;
-    return textOfEdit({ clip, floaters, up: isUpChosen ? up : null, background });
+    return textOfEdit({ clip: this.viewer.clip, ...this.state });
   }
 
   private tellEdit(): void {
@@ -277,6 +323,12 @@ export class Panel {
   }
 
   private pressKey(event: KeyboardEvent): void {
+    const key = event.key.toLowerCase();
+    if ((event.ctrlKey || event.metaKey) && !event.altKey && (key === "z" || key === "y")) {
+      event.preventDefault();
+      const isBack = key === "z" && !event.shiftKey;
+      this.restore(isBack ? this.history.undo() : this.history.redo());
+    }
     if (event.altKey || event.metaKey || event.ctrlKey) return;
     if (event.target instanceof HTMLSelectElement || event.target instanceof HTMLInputElement) return;
     const mode = MODES.at(Number(event.key) - 1);

@@ -7,6 +7,7 @@ import type { Clip } from "./extent";
 import type { Ends } from "./format";
 import { Program, Target } from "./gl";
 import type { Vec2, Vec3 } from "./math";
+import { SUBJECT_BIT } from "./packing";
 import { BATCH, MODES, SCREEN_FRAGMENT, SCREEN_VERTEX, splatFragment, splatVertex } from "./shaders";
 import type { Mode, Variant } from "./shaders";
 import type { Splats } from "./splats";
@@ -139,12 +140,13 @@ export class Renderer {
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
   }
 
-  private limit(splat: Program, { axes, low, high, floating }: Clip): void {
+  private limit(splat: Program, { axes, low, high, floating, isAlone }: Clip): void {
     const { gl } = this;
     gl.uniform3fv(splat.at("boxAxes"), axes.flat());
     gl.uniform3fv(splat.at("boxLow"), low);
     gl.uniform3fv(splat.at("boxHigh"), high);
     gl.uniform1f(splat.at("floating"), floating);
+    gl.uniform1ui(splat.at("wanted"), isAlone ? SUBJECT_BIT : 0);
   }
 
   private drawPart(splats: Splats, shown: Shown, { mode, from, to }: Part, start: number, end: number): void {

@@ -72,6 +72,7 @@ uniform vec2 size;
 uniform float nearPlane, peak;
 uniform vec3 boxAxes[3], boxLow, boxHigh;
 uniform float floating;
+uniform uint wanted;
 uniform vec2 scaleEnds, quatEnds, opacityEnds, shapeEnds, harmonicEnds[4];
 
 flat out vec4 axes;
@@ -209,7 +210,7 @@ void main() {
   vec3 inBox = vec3(dot(boxAxes[0], position), dot(boxAxes[1], position), dot(boxAxes[2], position));
   if (any(lessThan(inBox, boxLow)) || any(greaterThan(inBox, boxHigh))) return;
   uvec4 second = wordsAt(rows, 2u * row + 1u);
-  if (float(second.z >> 24) > floating) return;
+  if (float(second.z >> 24) > floating || (second.y & wanted) != wanted) return;
   float opacity = values(second.x, opacityEnds).a;
   float cutoff = 2.0 * log(255.0 * opacity * peak);
   if (mode == ELLIPSES) cutoff = opacity < 0.02 ? 0.0 : 2.0;
@@ -245,7 +246,7 @@ void main() {
   mean = vec3(middle, depth);
 
   vec4 base = values(first.w, harmonicEnds[0]);
-  vec3 color = colorOf(base.rgb, second.w, int(second.y >> 26), normalize(position - center));
+  vec3 color = colorOf(base.rgb, second.w, int(second.y >> 26 & 3u), normalize(position - center));
   uvec2 sides = uvec2(second.y >> 16, second.y >> 21) & 31u;
   region = uvec3(second.z & 0xffffffu, sides);
   if (sides.x == 0u) region.yz = uvec2(0);

@@ -59,6 +59,8 @@ export class Viewer implements Steered {
   crop: Crop = WHOLE;
   /** Strictness with which floaters are hidden, 0 to 1. */
   floaters = 0;
+  /** Whether only the subject is shown. */
+  isAlone = false;
   /** The background that the user has chosen; null shows the scene's own. */
   background: Vec3 | null = null;
   /** Stops by which colours are brighter. */
@@ -149,8 +151,9 @@ export class Viewer implements Steered {
     return fitted(this.image, Math.max(clientWidth, 1), Math.max(clientHeight, 1), this.fit);
   }
 
-  chooseUp(up: Vec3): void {
-    [this.up, this.isUpChosen] = [up, true];
+  /** Set the vertical; null takes the scene's. */
+  chooseUp(up: Vec3 | null): void {
+    [this.up, this.isUpChosen] = [up ?? this.ownUp, up !== null];
     this.draw();
   }
 
@@ -203,8 +206,17 @@ export class Viewer implements Steered {
   }
 
   get clip(): Clip {
-    const extent = this.splats === null ? UNIT : extentOf(this.splats.header.means);
-    return clipOf(extent, this.up, this.crop, this.floaters);
+    const isAlone = this.isAlone && this.splats?.header.hasSubject === true;
+    return clipOf(this.box, this.up, this.crop, this.floaters, isAlone);
+  }
+
+  /** Extent of the scene. */
+  get box(): Extent {
+    return this.splats === null ? UNIT : extentOf(this.splats.header.means);
+  }
+
+  private get ownUp(): Vec3 {
+    return this.splats === null ? this.up : verticalOfScene(this.splats.header);
   }
 
   private get depthRow(): Row4 {

@@ -121,20 +121,29 @@ test("links preserve a view", () => {
   const edit = {
     crop,
     floaters: 0.3,
+    isAlone: true,
     background: [1, 0.5, 0] as const,
     exposure: -1.5,
     isFlying: true,
     hasPanel: false,
   };
   const view = viewOf(linkOf({ pose: POSE, lens: LENS, mode: "depth", fit: "close", up: [0, 0.6, 0.8], ...edit }));
-  expect([view?.crop, view?.floaters, view?.background]).toEqual([crop, 0.3, [1, 0.5, 0]]);
+  expect([view?.crop, view?.floaters, view?.background, view?.isAlone]).toEqual([crop, 0.3, [1, 0.5, 0], true]);
   expect([view?.exposure, view?.isFlying, view?.hasPanel]).toEqual([-1.5, true, false]);
   expect(view?.mode).toBe("depth");
   expectClose(view?.pose.position ?? [], POSE.position, 5);
   expectClose(view?.pose.rotation.flat() ?? [], POSE.rotation.flat(), 5);
   expect(view?.lens).toEqual(LENS);
   expect([view?.fit, view?.up]).toEqual(["close", [0, 0.6, 0.8]]);
-  const none = { crop: WHOLE, floaters: 0, background: null, exposure: 0, isFlying: false, hasPanel: true };
+  const none = {
+    crop: WHOLE,
+    floaters: 0,
+    isAlone: false,
+    background: null,
+    exposure: 0,
+    isFlying: false,
+    hasPanel: true,
+  };
   const link = linkOf({ pose: POSE, lens: LENS, mode: "full", fit: "whole", up: null, ...none });
   const plain = viewOf(link);
   expect([plain?.fit, plain?.up, plain?.crop]).toEqual(["whole", null, WHOLE]);

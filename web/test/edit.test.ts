@@ -28,6 +28,11 @@ test("an edit holds what was changed, with null where a box is open", () => {
   });
 });
 
+test("the subject alone is an edit", () => {
+  const text = textOfEdit({ ...NOTHING, clip: clipOf(EXTENT, [0, 0, 1], WHOLE, 0, true) });
+  expect(JSON.parse(text ?? "")).toEqual({ format: "a2tg-jax edit", version: 1, subject: true });
+});
+
 test("colours of the picker are numbers and back", () => {
   expect(hexOf(colorOf("#ff8001"))).toBe("#ff8001");
   expect(colorOf("#ff0000")).toEqual([1, 0, 0]);

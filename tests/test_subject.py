@@ -1,0 +1,239 @@
+"""The subject of a capture: found in scenes of which it is known, refused where there is none."""
+
+import dataclasses
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from small_files import model_in, taken_apart
+from small_values import some_world
+
+import a2tg_jax as a2tg
+from a2tg_jax import Gaussians, Model, Origin
+from a2tg_jax.cli.main import main
+from a2tg_jax.io.columns import decode
+from a2tg_jax.io.subject import find_subject
+from a2tg_jax.io.web_scene import encode_web_scene
+
+K = jnp.asarray([[80.0, 0, 40], [0, 80.0, 30], [0, 0, 1]])
+UP = np.array([0.0, 0.0, 1.0])
+
+
+class Splats:
+    """Flat splats of surfaces, and which of them are the subject's."""
+
+    def __init__(self, seed: int):
+        self.rng = np.random.default_rng(seed)
+        self.columns = []
+
+    def add(self, means, normals, *, size, opacity, is_subject):
+        """Splats in a surface: their axes are turned at random about its normals."""
+        num = len(means)
+        normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+        side = np.cross(normals, self.rng.normal(size=(num, 3)))
+        side /= np.linalg.norm(side, axis=1, keepdims=True)
+        axes = np.stack([side, np.cross(normals, side), normals], axis=2)
+        quats = Rotation.from_matrix(axes).as_quat(scalar_first=True)
+        sizes = size * self.rng.uniform(0.7, 1.4, (num, 2))
+        self.columns.append((means, quats, np.log(sizes), np.full(num, opacity), np.full(num, is_subject)))
+
+    def add_object(self, foot):
+        """A ball on a column on a box."""
+        for num, low, high in (
+            (900, (-0.1, -0.2, 0), (0.1, 0.2, 0.15)),
+            (300, (-0.03, -0.03, 0.15), (0.03, 0.03, 0.3)),
+        ):
+            axis = self.rng.integers(0, 3, num)
+            sign = self.rng.choice([-1, 1], num)
+            # No camera sees what a thing stands on.
+            normals = np.eye(3)[axis] * np.where(axis == 2, 1, sign)[:, None]
+            shares = np.where(normals == 0, self.rng.uniform(-1, 1, (num, 3)), normals)
+            middle = (np.array(low) + high) / 2
+            self.add(
+                foot + middle + shares * (np.array(high) - middle), normals, size=0.012, opacity=0.9, is_subject=True
+            )
+        normals = self.rng.normal(size=(900, 3))
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        self.add(foot + 0.1 * normals + [0, 0, 0.4], normals, size=0.01, opacity=0.9, is_subject=True)
+
+    def add_floor(self, size=1.5, num=4000):
+        places = self.rng.uniform(-size, size, (num, 2))
+        means = np.c_[places, self.rng.normal(0, 0.003, num)]
+        normals = UP + self.rng.normal(0, 0.05, (num, 3))
+        self.add(means, normals, size=0.03, opacity=0.8, is_subject=False)
+
+    def add_room(self):
+        """Far walls, haze, and a thing that stands on the floor as well."""
+        angle = self.rng.uniform(0, 2 * np.pi, 1500)
+        means = np.c_[4 * np.cos(angle), 4 * np.sin(angle), self.rng.uniform(-1, 3, 1500)]
+        self.add(means, -means * [1, 1, 0], size=0.2, opacity=0.8, is_subject=False)
+        haze = self.rng.uniform(-1.5, 1.5, (200, 3)) + np.array([0, 0, 1.6])
+        self.add(haze, self.rng.normal(size=(200, 3)), size=0.05, opacity=0.1, is_subject=False)
+        thing = self.rng.uniform(-0.1, 0.1, (400, 3)) + np.array([0.45, 0.2, 0.12])
+        self.add(thing, self.rng.normal(size=(400, 3)), size=0.015, opacity=0.9, is_subject=False)
+
+    def model(self, cameras):
+        means, quats, log_scales, opacities, _ = (np.concatenate(parts) for parts in zip(*self.columns, strict=True))
+        numbers = (means, quats, log_scales, np.log(opacities / (1 - opacities)), np.zeros((len(means), 1, 3)))
+        gaussians = Gaussians(*(jnp.asarray(x, jnp.float32) for x in numbers))
+        return Model(gaussians, origin=Origin.of_cameras(cameras))
+
+    @property
+    def is_subject(self):
+        return np.concatenate([parts[-1] for parts in self.columns])
+
+
+def cameras_at(centers, targets):
+    """Cameras of photographs that are held a little askew."""
+    rng = np.random.default_rng(5)
+    cameras = []
+    for center, target in zip(centers, targets, strict=True):
+        viewmat = a2tg.look_at(center, target + rng.normal(0, 0.05, 3), up=UP, width=80, height=60).viewmat
+        cameras.append(a2tg.Camera(viewmat, K, 80, 60))
+    return cameras
+
+
+def ring(num=24, radius=1.0, turn=2 * np.pi, height=0.5):
+    angles = np.linspace(0, turn, num, endpoint=False)
+    return np.stack([radius * np.cos(angles), radius * np.sin(angles), height + 0.2 * np.sin(3 * angles)], axis=1)
+
+
+def around(target, **places):
+    centers = ring(**places)
+    return cameras_at(centers, np.tile(np.asarray(target, float), (len(centers), 1)))
+
+
+def shares(found, wanted):
+    """Precision and recall."""
+    both = np.sum(found & wanted)
+    return both / max(found.sum(), 1), both / wanted.sum()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_object_on_a_floor_is_found_in_any_world(seed):
+    """With another thing on the floor, walls and haze. Of what touches the floor, its thickness may go with it."""
+    splats = Splats(seed)
+    splats.add_object(np.zeros(3))
+    splats.add_floor()
+    splats.add_room()
+    model = splats.model(around([0, 0, 0.25]))
+    subject = find_subject(model)
+    precision, recall = shares(subject.is_kept, splats.is_subject)
+    assert precision > 0.99 and recall > 0.96
+    assert subject.sureness > 0.9 and subject.words.endswith("% sure")
+    moved = find_subject(model.transform(some_world(seed)))
+    assert min(shares(moved.is_kept, subject.is_kept)) > 0.99
+
+
+def test_an_object_in_front_of_a_wall_is_found_from_one_side():
+    splats = Splats(0)
+    splats.add_object(np.array([0.0, 0.0, -0.25]))
+    places = splats.rng.uniform(-1.5, 1.5, (4000, 2))
+    wall = np.c_[splats.rng.normal(-0.25, 0.003, 4000), places]
+    splats.add(wall, np.tile([1.0, 0, 0], (4000, 1)), size=0.03, opacity=0.8, is_subject=False)
+    # A rod that holds it.
+    rod = np.c_[np.linspace(-0.25, 0, 200), splats.rng.normal(0, 0.01, (200, 2))]
+    splats.add(rod, splats.rng.normal(size=(200, 3)), size=0.01, opacity=0.9, is_subject=True)
+    centers = ring(turn=np.pi * 0.6, height=0.1) @ Rotation.from_euler("z", -54, degrees=True).as_matrix().T
+    model = splats.model(cameras_at(centers, np.zeros_like(centers)))
+    precision, recall = shares(find_subject(model).is_kept, splats.is_subject)
+    assert precision > 0.99 and recall > 0.95
+
+
+def test_what_ends_by_itself_is_kept_with_all_its_planes():
+    """The top of the box has the area of a floor."""
+    splats = Splats(0)
+    splats.add_object(np.zeros(3))
+    subject = find_subject(splats.model(around([0, 0, 0.25])))
+    assert subject.is_kept.mean() > 0.99
+
+
+def test_an_object_that_touches_a_wall_is_cut_along_the_seam_and_less_sure():
+    splats = Splats(0)
+    splats.add_object(np.zeros(3))
+    splats.add_floor()
+    splats.add_room()
+    free = find_subject(splats.model(around([0, 0, 0.25])))
+    # A beam through the column, which goes on beyond the cameras.
+    beam = np.c_[np.linspace(-2, 2, 3000), splats.rng.normal(0, 0.01, 3000), 0.22 + splats.rng.normal(0, 0.01, 3000)]
+    splats.add(beam, splats.rng.normal(size=(3000, 3)), size=0.012, opacity=0.9, is_subject=False)
+    touching_model = splats.model(around([0, 0, 0.25]))
+    touching = find_subject(touching_model)
+    assert shares(touching.is_kept, splats.is_subject)[1] > 0.95
+    distances = np.linalg.norm(np.asarray(touching_model.gaussians.means)[touching.is_kept] - [0, 0, 0.25], axis=1)
+    assert distances.max() < 0.5
+    assert touching.sureness < free.sureness
+
+
+def looking(model, cameras):
+    return dataclasses.replace(model, origin=Origin.of_cameras(cameras))
+
+
+def test_without_a_subject_it_is_refused():
+    splats = Splats(0)
+    splats.add_floor()
+    splats.add_room()
+    model = splats.model([])
+    centers = ring(radius=0.3)
+    along = np.c_[np.linspace(-3, 3, 20), np.zeros(20), np.full(20, 0.5)]
+    turned = ring(num=20, radius=4.0)
+    refused = {
+        "at least 3 cameras look at, and the model has 0": [],
+        "the model has 2": around([0, 0, 0.25], num=2),
+        "look away from the point that their axes have in common": cameras_at(centers, 9 * centers),
+        "look in parallel": cameras_at(along, along + np.array([0, 5, 0])),
+        "see nothing near the point": around([0, 0, 3.0], radius=1.5, height=3.0),
+        "outwards or along a way": cameras_at(turned, turned + np.cross(UP, turned)),
+    }
+    for message, cameras in refused.items():
+        with pytest.raises(ValueError, match=f"no subject: .*{message}"):
+            find_subject(looking(model, cameras))
+
+
+def a_capture():
+    splats = Splats(0)
+    splats.add_object(np.zeros(3))
+    splats.add_floor()
+    splats.add_room()
+    return splats.model(around([0, 0, 0.25]))
+
+
+def test_the_command_writes_an_edit_or_a_model_and_says_how_sure_it_is(tmp_path, capsys):
+    model = a_capture()
+    a2tg.save_model(tmp_path / "m.npz", model)
+    for name in ("e.json", "a.npz"):
+        assert main(["edit", str(tmp_path / "m.npz"), "--out", str(tmp_path / name), "--subject"]) == 0
+    printed = capsys.readouterr().out
+    assert printed.count(f"subject: {find_subject(model).words}") == 2 and "% sure" in printed
+    edit = a2tg.load_edit(tmp_path / "e.json")
+    assert edit.subject and json.loads((tmp_path / "e.json").read_text())["subject"] is True
+    wanted = model[find_subject(model).is_kept]
+    for edited in (a2tg.apply_edit(model, edit), a2tg.load_model(tmp_path / "a.npz")):
+        np.testing.assert_array_equal(edited.gaussians.means, wanted.gaussians.means)
+    a2tg.save_ply(tmp_path / "bare.ply", dataclasses.replace(model, origin=None))
+    words = ["edit", str(tmp_path / "bare.ply"), "--out", str(tmp_path / "b.ply"), "--subject"]
+    assert main(words) == 2
+    assert "no subject: it follows from what at least 3 cameras look at, and the model has 0" in capsys.readouterr().err
+
+
+def test_pages_have_the_same_subject():
+    model = a_capture()
+    subject = find_subject(model)
+    header, body = taken_apart(data := encode_web_scene(model))
+    marks = []
+    start = 0
+    for name, coder, length in header["parts"]:
+        if name == "subject":
+            count = min(header["chunk"], model.num - sum(map(len, marks)))
+            marks.append(decode(coder, body[start : start + length], 1, count)[0])
+        start += length
+    sizes = {
+        name: sum(length for other, _, length in header["parts"] if other == name) for name in ("subject", "means")
+    }
+    assert 0 < sizes["subject"] < 0.02 * sizes["means"]
+    assert np.sum(np.concatenate(marks)) == np.sum(subject.is_kept)
+    assert header["page"]["subject"] == subject.words
+    assert "subject" not in taken_apart(encode_web_scene(model, finds_subject=False))[0]["page"]
+    assert model_in(data).num == model.num
