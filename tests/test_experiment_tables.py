@@ -180,7 +180,7 @@ NOTEBOOK = EXPERIMENTS / "NOTEBOOK.md"
 MADE_OF_MODELS = {"efficiency"}
 
 
-@pytest.mark.parametrize("scale", ["small", "long", "protocol"])
+@pytest.mark.parametrize("scale", ["small", "long", "protocol", "claims"])
 def test_committed_tables_are_those_of_the_committed_records(tmp_path, scale):
     committed = EXPERIMENTS / "results" / scale
     shutil.copytree(committed.parent, tmp_path / "results")
@@ -236,10 +236,11 @@ def test_the_page_has_one_size_of_the_papers_size():
 
 
 def test_the_chosen_plain_methods_are_those_of_the_committed_validation_records():
-    records = read_kept(EXPERIMENTS / "results" / "protocol-validation" / "records.json")
-    grid = read_grid("choose_plain", "protocol", validation=True)
-    best = choose_plain.best_methods(tables.results_of(grid, records), 1 + len(grid.methods))
-    assert best == json.loads(choose_plain.FILES["protocol"].read_text(encoding="utf-8"))
+    for scale, path in choose_plain.FILES.items():
+        records = read_kept(EXPERIMENTS / "results" / f"{scale}-validation" / "records.json")
+        grid = read_grid("choose_plain", scale, validation=True)
+        best = choose_plain.best_methods(tables.results_of(grid, records), 1 + len(grid.methods))
+        assert best == json.loads(path.read_text(encoding="utf-8"))
 
 
 def test_pages_show_the_committed_tables():
@@ -256,8 +257,9 @@ def test_figures_in_sentences_on_results_are_in_tables():
     readme = (EXPERIMENTS.parent / "README.md").read_text(encoding="utf-8")
     (sentences,) = re.findall(r"^## Findings\n(.*?)^## ", readme, re.DOTALL | re.MULTILINE)
     sentences += pages.BLOCK.sub("", RESULTS.read_text(encoding="utf-8"))
-    folder = EXPERIMENTS / "results" / "protocol"
-    shown = " ".join(path.read_text(encoding="utf-8") for path in folder.glob("*.md"))
+    folder = EXPERIMENTS / "results"
+    files = [path for scale in ("protocol", "claims") for path in (folder / scale).glob("*.md")]
+    shown = " ".join(path.read_text(encoding="utf-8") for path in files)
     with_interval = r"\d\.\d{2,}(?: ± \d\.\d{2,})?"
     figures = {f"{gain:.2f}" for gain in gains_in_the_paper()}
     figures |= {*re.findall(r"\d\.\d{2,}", shown), *re.findall(with_interval, shown)}
