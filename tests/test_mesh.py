@@ -278,6 +278,7 @@ def test_large_voxels_fill_what_small_ones_do_not_know():
 
 def test_a_mesh_says_how_much_of_the_views_it_lacks(model):
     whole = a2tg.extract_mesh(model, resolution=80)
+    assert a2tg.extract_mesh(model, resolution=80, fill_holes=False).num_bytes < whole.num_bytes
     part = a2tg.extract_mesh(model, resolution=80, least_weight=2.0)
     assert whole.missing < 0.01
     assert part.mesh.area < 0.95 * whole.mesh.area

@@ -5,7 +5,7 @@ jaxopt has no Adam. No other module imports jaxopt.
 
 import math
 import warnings
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,9 +16,6 @@ from a2tg_jax.base.checks import check_array, check_floats, check_kind, check_nu
 from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.text import shortened
 from a2tg_jax.core.pytree import pytree
-
-if TYPE_CHECKING:
-    from jaxopt import OptStep as OptStep  # type: ignore[import-untyped]
 
 
 @pytree
@@ -61,7 +58,7 @@ def adam_update(
     b1: float = 0.9,
     b2: float = 0.999,
     eps: float = 1e-15,  # as in 3DGS: gradients of one Gaussian may be far below 1e-8
-) -> "OptStep":
+) -> Any:
     """Make one bias-corrected update of Adam (Kingma & Ba, 2015); ε is added after the correction, as in PyTorch.
 
     Args:
@@ -75,7 +72,7 @@ def adam_update(
       eps: ε ≥ 0.
 
     Returns:
-      The named tuple (params, state): the updated parameters, and the state for the next update.
+      jaxopt's named tuple OptStep(params, state): the updated parameters, and the state for the next update.
 
     Raises:
       ValueError: if parameters are not floats, gradients, moments or rates do not fit them, naming the leaf, or a
@@ -123,7 +120,7 @@ def adam_update(
         # jaxopt warns at import that it is no longer maintained, about which users of this package can do nothing. It
         # is imported here because it brings SciPy's optimisers, a quarter of the time of importing this package.
         warnings.filterwarnings("ignore", message="JAXopt is no longer maintained", category=DeprecationWarning)
-        from jaxopt import OptStep
+        from jaxopt import OptStep  # type: ignore[import-untyped]
 
     params = jax.tree.map(step, _rate_of_each(rates, params), params, mu, nu)
     return OptStep(params=params, state=AdamState(mu, nu, count))

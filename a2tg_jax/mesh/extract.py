@@ -96,6 +96,7 @@ def extract_mesh(
     center: np.ndarray | None = None,
     radius: float | None = None,
     unbounded: bool = False,
+    fill_holes: bool = True,
     least_weight: float = LEAST_WEIGHT,
     most_clusters: int = MOST_CLUSTERS,
     least_faces: int = LEAST_FACES,
@@ -107,7 +108,7 @@ def extract_mesh(
 
     The depths of each view are fused into a truncated signed distance function on sparse voxels. A depth is the mean of
     the splats on a ray, with less weight if they are far apart. Where it is too uncertain for these voxels, larger ones
-    fill the surface. Small connected parts are removed.
+    fill the surface (`fill_holes`). Small connected parts are removed.
 
     Args:
       model: a model of any appearance.
@@ -117,6 +118,8 @@ def extract_mesh(
       center: [3] centre of the space to fuse, in the model's world; None is the point nearest to all optical axes.
       radius: radius of that space; None is twice the cameras' median distance from the centre.
       unbounded: extend the space beyond the radius, with voxels that grow in proportion to their distance.
+      fill_holes: fill the surface by larger voxels where depths are too uncertain; False: leave holes, for surfaces
+        that are a little more accurate.
       least_weight: voxels up to this weight have no surface. One view with a sharp depth has a weight of 1.
       most_clusters: largest number of connected parts to keep.
       least_faces: smallest number of triangles in a part.
@@ -175,7 +178,7 @@ def extract_mesh(
             f"lower `voxel` to {LARGEST_VOXEL:g} of the radius at most, or raise `radius`"
         )
     # A level takes at most a third of the bytes that the one before takes.
-    sides = _voxels_of_levels(voxel, radius)
+    sides = _voxels_of_levels(voxel, radius) if fill_holes else [voxel]
     spaces = [Space.of(center, radius, side, unbounded) for side in sides]
     grids = [BlockGrid(int(2 / 3 * max_bytes / 3**level)) for level in range(len(sides))]
     seen: list[np.ndarray] = []
@@ -206,7 +209,8 @@ def extract_mesh(
             "there is no surface within the radius around the point that the cameras look at: give a larger `radius`, "
             "or `unbounded`"
         )
-    missing = _share_missing(mesh, np.concatenate(seen), sides)
+    distances, _ = cKDTree(mesh.vertices).query(np.concatenate(seen))
+    missing = float(np.mean(distances > TRUNCATION * voxel)) if len(distances) else 0.0
     seconds = time.perf_counter() - start
     return MeshResult(mesh, center, radius, voxel, len(cameras), num_dropped, missing, num_bytes, seconds)
 
@@ -229,24 +233,11 @@ def _pixel_at(center: np.ndarray, cameras: Sequence[Camera]) -> float:
 
 
 def _sampled(depths: RenderedDepth, space: Space, num: int) -> np.ndarray:
-    """Return about `num` points with a depth in the space, [P, 4]: position, and standard deviation of the depth."""
+    """Return about `num` points [P, 3] of a view with a depth within the space."""
     points = np.asarray(back_project(depths.depth, depths.camera)).reshape(-1, 3)
-    spread = np.asarray(depths.spread).reshape(-1)
     chosen = np.arange(0, len(points), max(1, len(points) // max(num, 1)))
     has_depth = np.asarray(depths.depth).reshape(-1)[chosen] > 0
-    is_inside = np.asarray(space.contains(jnp.asarray(points[chosen])))
-    chosen = chosen[has_depth & is_inside]
-    return np.column_stack([points[chosen], spread[chosen]])
-
-
-def _share_missing(mesh: Mesh, seen: np.ndarray, sides: Sequence[float]) -> float:
-    """Return the share of points with standard deviations [P, 4] that have no vertex within that, or within a
-    truncation of the smallest voxels; beyond a truncation of the largest ones a surface is another one."""
-    if not len(seen):
-        return 0.0
-    distances, _ = cKDTree(mesh.vertices).query(seen[:, :3])
-    reach = np.clip(seen[:, 3], TRUNCATION * sides[0], TRUNCATION * sides[-1])
-    return float(np.mean(distances > reach))
+    return points[chosen][has_depth & np.asarray(space.contains(jnp.asarray(points[chosen])))]
 
 
 def check_lengths(resolution: int | None, voxel: float | None, radius: float | None) -> None:

@@ -69,6 +69,7 @@ def write_mesh(
         voxel=None if options.voxel is None else options.voxel * scale,
         radius=None if options.radius is None else options.radius * scale,
         unbounded=options.unbounded,
+        fill_holes=options.fill_holes,
         most_clusters=options.clusters,
         max_bytes=int(GRID_SHARE * memory_limit()) if max_bytes is None else max_bytes,
         settings=source.settings,

@@ -124,6 +124,9 @@ class MeshOptions:
     """Radius around the point that the cameras look at, in units of the original world."""
     unbounded: bool = False
     """Continue beyond the radius, with voxels that grow with the distance."""
+    fill_holes: bool = True
+    """Fill the surface by larger voxels where it is uncertain. Without, there are holes, and the rest is a little more
+    accurate."""
     clusters: int = 50
     """Largest number of connected parts to keep; smaller ones are floaters."""
     faces: int | None = None

@@ -7,7 +7,7 @@ values, and its status makes all further steps idle, so that Python may read it 
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -37,9 +37,6 @@ from a2tg_jax.training.gradients import TracedView, differentiate
 from a2tg_jax.training.returned import calling, check_kept, check_scalar, checked_change
 from a2tg_jax.training.stage import Background, Clock, Stage
 from a2tg_jax.training.terms import Target
-
-if TYPE_CHECKING:
-    from a2tg_jax.core.optim import OptStep
 
 FINE, OVERFLOW, NOT_FINITE, IMPOSSIBLE, EXPLODED = range(5)
 """Status of a state: the reason why the last step was not taken."""
@@ -328,9 +325,9 @@ def batch_gradients(
     return with_rows_of_views_divided(settings.mesh, views)
 
 
-def optimized(stage: Stage, state: TrainState, grads: Any, rate_of_means: Array, progress: Array) -> "OptStep":
-    """Return the model's floats and their moments after Adam, given the gradients of the Gaussians and of the floats of
-    their appearance, the present rate of the means, and the share of the stage that is done."""
+def optimized(stage: Stage, state: TrainState, grads: Any, rate_of_means: Array, progress: Array) -> Any:
+    """Return the result of `adam_update` for the model's floats, given the gradients of the Gaussians and of the floats
+    of their appearance, the present rate of the means, and the share of the stage that is done."""
     floats, _ = partition(state.model)
     of_gaussians = stage.rates.of_gaussians(rate_of_means, floats.gaussians.sh_degree)
     of_appearance = floats.appearance.rates(0.0 if stage.appearance_rate is None else stage.appearance_rate)
