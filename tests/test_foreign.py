@@ -29,7 +29,7 @@ def handler(arguments, results):
 def refuse(*_):
     raise RuntimeError("refused to print")
 
-name = ffi.registered("test", None, lambda: handler)
+name = ffi.registered("test", None, 1, lambda: handler)
 run = jax.jit(jax.ffi.ffi_call(name, jax.ShapeDtypeStruct((3,), jnp.float32)))
 run(jnp.zeros(3)).block_until_ready()  # compiled: no step of Python lies between the caller and the handler now
 x = jnp.ones(3) + {more}
@@ -80,7 +80,7 @@ def test_an_error_that_cannot_be_written_is_told_all_the_same():
     def handler(arguments, results):
         raise Silent
 
-    name = ffi.registered("test silent", None, lambda: handler)
+    name = ffi.registered("test silent", None, 1, lambda: handler)
     with pytest.raises(jax.errors.JaxRuntimeError, match=r"Silent: .*failed"):
         jax.block_until_ready(jax.ffi.ffi_call(name, jax.ShapeDtypeStruct((3,), jnp.float32))(jnp.zeros(1)))
 
@@ -89,7 +89,7 @@ def test_results_are_views_of_the_buffers():
     def handler(arguments, results):
         results[0][...] = 2 * arguments[0]
 
-    name = ffi.registered("test double", None, lambda: handler)
+    name = ffi.registered("test double", None, 1, lambda: handler)
     x = jnp.arange(6, dtype=jnp.float32).reshape(2, 3)
     np.testing.assert_array_equal(jax.ffi.ffi_call(name, jax.ShapeDtypeStruct((2, 3), jnp.float32))(x), 2 * x)
 
@@ -110,7 +110,7 @@ def hundred(x):
         x = call(x)
     return x
 
-begun, name = threading.Event(), ffi.registered("test", None, lambda: handler)
+begun, name = threading.Event(), ffi.registered("test", None, 1, lambda: handler)
 call = jax.ffi.ffi_call(name, jax.ShapeDtypeStruct((3,), jnp.float32))
 run = jax.jit(hundred)
 run(jnp.zeros(3)).block_until_ready()

@@ -85,10 +85,10 @@ class PassSettings(NamedTuple):
         """Number S of floats per splat: M, opacity, colours, normal with geometry, own numbers, and the cutoff."""
         return 10 + self.num_colors + 3 * self.has_geometry + self.num_own_numbers + 1
 
-    def gradient_shapes(self, inputs: "PassInputs") -> tuple[tuple[int, ...], ...]:
-        """Return the shapes of a kernel's gradients of packed splats, texels and probe; without a statistic [1, 4]."""
-        num = len(inputs.cutoff)
-        return (num, self.num_floats), inputs.texels.shape, (num if self.statistic else 1, 4)
+    def gradient_shapes(self, num: int, texels: tuple[int, ...]) -> tuple[tuple[int, ...], ...]:
+        """Return the shapes of a kernel's gradients of `num` packed splats, of texels of a shape, and of the probe;
+        without a statistic [1, 4]."""
+        return (num, self.num_floats), texels, (num if self.statistic else 1, 4)
 
 
 class PassInputs(NamedTuple):

@@ -1,6 +1,7 @@
 """The render of a view that training differentiates, with a fixed capacity."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,7 @@ from a2tg_jax.rasterize.render_types import Geometry, RenderOutput, RenderSettin
 from a2tg_jax.rasterize.splats import project_gaussians, settings_of_pass
 from a2tg_jax.rasterize.tile_pixels import tile_pixels
 from a2tg_jax.rasterize.tiles import TileGrid
+from a2tg_jax.rasterize.view_groups import in_groups
 
 
 def render_traced(
@@ -75,6 +77,25 @@ def render_traced(
         nothing = channels, jnp.ones(size, background.dtype), num_colors, has_geometry, background, jnp.asarray(False)
         return _output(*nothing), jnp.zeros((), jnp.float32)
     degree = settings.sh_degree if sh_degree is None else sh_degree
+    view = functools.partial(_render_view, settings, has_geometry, statistic)
+    return in_groups(view, num, gaussians, camera, appearance, background, degree, num_live, probe)
+
+
+def _render_view(
+    settings: RenderSettings,
+    has_geometry: bool,
+    statistic: Statistic | None,
+    gaussians: Gaussians,
+    camera: Camera,
+    appearance: Appearance,
+    background: Array,
+    degree: Integer,
+    num_live: Integer | None,
+    probe: Array | None,
+) -> tuple[RenderOutput, Array]:
+    """Return the results of `render_traced`, without supersampling, for N >= 1 Gaussians."""
+    num = gaussians.num
+    num_colors = num_colors_of(appearance)
     splats, cutoff = project_gaussians(gaussians, camera, appearance, settings.near_plane, degree, num_live)
     grid = TileGrid(camera.width, camera.height, settings.tile_size)
     compositing, texels, regions = settings_of_pass(

@@ -7,7 +7,8 @@
 // prepares each for the tile there, and lets every pixel take them in turn.
 
 typedef struct {
-  int tile, first, last;      // The tile, and where its list begins and ends.
+  int tile, view;             // The tile, counted through all views, and its view.
+  int first, last;            // Where its list begins and ends.
   int pixel, is_inside;       // Index within the tile, row by row; whether the pixel belongs to the image.
   real x, y, tile_x, tile_y;  // The pixel, counted from the tile's centre; the centre, in pixels of the image.
 } Place;
@@ -28,17 +29,20 @@ INLINE int pixel_of(int k) {
   return (block / columns * 4 + k % 32 / 8) * TILE_SIZE + block % columns * 8 + k % 8;
 }
 
+// size: columns of tiles, width and height of a view, and its tiles. A view has a start more than it has tiles.
 INLINE Place place_of(GLOBAL const int *starts, GLOBAL const int *size) {
   Place at;
   int k = BLOCK % PARTS * THREADS + THREAD;
   at.tile = BLOCK / PARTS;
-  at.first = starts[at.tile];
-  at.last = starts[at.tile + 1];
+  at.view = at.tile / size[3];
+  at.first = starts[at.tile + at.view];
+  at.last = starts[at.tile + at.view + 1];
+  int own = at.tile % size[3];
   at.pixel = pixel_of(k);
   at.x = (real)(at.pixel % TILE_SIZE) - (real)(TILE_SIZE - 1) / 2;
   at.y = (real)(at.pixel / TILE_SIZE) - (real)(TILE_SIZE - 1) / 2;
-  at.tile_x = (real)(at.tile % size[0] * TILE_SIZE) + (real)TILE_SIZE / 2;
-  at.tile_y = (real)(at.tile / size[0] * TILE_SIZE) + (real)TILE_SIZE / 2;
+  at.tile_x = (real)(own % size[0] * TILE_SIZE) + (real)TILE_SIZE / 2;
+  at.tile_y = (real)(own / size[0] * TILE_SIZE) + (real)TILE_SIZE / 2;
   at.is_inside = k < NUM_PIXELS && at.tile_x + at.x < size[1] && at.tile_y + at.y < size[2];
   return at;
 }
@@ -164,7 +168,7 @@ KERNEL(backward)(
   int own = at.is_inside ? at.pixel : 0;
   center[0] = at.tile_x;
   center[1] = at.tile_y;
-  for (int k = 0; k < 9; k++) jacobian[k] = jacobians[k];
+  for (int k = 0; k < 9; k++) jacobian[k] = jacobians[at.view * 9 + k];
   for (int c = 0; c < NUM_CHANNELS; c++) cotangents[c] = g[((INDEX)at.tile * NUM_CHANNELS + c) * NUM_PIXELS + own];
   suffix_sum = suffix_sums[(INDEX)at.tile * NUM_PIXELS + own];
   for (int start = at.first; start < at.last; start += BATCH) {

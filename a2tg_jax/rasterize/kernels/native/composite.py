@@ -51,7 +51,7 @@ def backward(
     """Return the cotangents of splats, texels and probe, as `xla.backward` does."""
     dtype = inputs.splats.M.dtype
     cotangents = [array.astype(dtype) for array in (g, suffix_sum, jacobian)]
-    shapes = [(shape, dtype) for shape in settings.gradient_shapes(inputs)]
+    shapes = [(shape, dtype) for shape in settings.gradient_shapes(len(inputs.cutoff), inputs.texels.shape)]
     name = _registered(settings.kernel_settings, "backward", _backward_handler)
     gradients = ffi.call(name, shapes, *_packed(settings, inputs), *cotangents)
     return unpack_gradients(settings, gradients, inputs, probe)
@@ -68,7 +68,8 @@ def _registered(
     kernel: PassSettings, name: Literal["forward", "backward"], make_handler: Callable[[CompiledFunction], ffi.Handler]
 ) -> str:
     description = f"compositor=native {name} {kernel!r}"
-    return ffi.registered(description, (name, kernel), lambda: make_handler(compiled_passes(kernel)[name]))
+    rank = 3 if name == "forward" else 2
+    return ffi.registered(description, (name, kernel), rank, lambda: make_handler(compiled_passes(kernel)[name]))
 
 
 def _forward_handler(run: CompiledFunction) -> ffi.Handler:
@@ -225,7 +226,10 @@ def tile_lists(M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capac
     """List the splats of each tile, with the arguments and result of `rasterize.tiles.tile_lists`."""
     key = str(M.dtype), grid.tile_size, near_plane
     name = ffi.registered(
-        f"compositor=native lists {key}", ("lists", key), lambda: functools.partial(_list_handler, list_functions(*key))
+        f"compositor=native lists {key}",
+        ("lists", key),
+        1,
+        lambda: functools.partial(_list_handler, list_functions(*key)),
     )
     results = ((capacity,), jnp.int32), ((grid.num + 1,), jnp.int32), ((), jnp.float32), ((), jnp.bool_)
     size = jnp.asarray([grid.columns, grid.width, grid.height], jnp.int32)

@@ -1,6 +1,7 @@
 """Functions on numpy arrays that XLA calls on CPUs, through its foreign function interface (xla/ffi/api/c_api.h).
 
-Handlers divide their work among threads (`run_spans`).
+Handlers divide their work among threads (`run_spans`). Under `vmap`, one call computes the whole batch: threads divide
+its members.
 
 XLA may still compute on its own threads when a program ends. A thread that then waits for Python's GIL never gets it:
 the program crashes or hangs. So these threads pass a gate in native code, which closes at the end. Threads that come
@@ -31,7 +32,7 @@ import numpy as np
 from jax import Array
 from jax.typing import DTypeLike
 
-from a2tg_jax.base.threads import num_threads as num_threads
+from a2tg_jax.base import threads
 from a2tg_jax.rasterize.kernels.native import llvm_code
 
 Handler = Callable[[list[np.ndarray], list[np.ndarray]], None]
@@ -91,6 +92,7 @@ _Entry = ctypes.CFUNCTYPE(_pointer, ctypes.POINTER(_CallFrame))
 _LOCK = threading.RLock()
 _AT_THE_END = _ErrorArguments(ctypes.sizeof(_ErrorArguments), None, b"the program is ending", INTERNAL_ERROR)
 ctypes.pythonapi.Py_IncRef(ctypes.py_object(_AT_THE_END))  # in use as long as the process lives
+_in_batch = threading.local()
 _entries: dict[str, tuple[Hashable, object]] = {}
 _num_inside = ctypes.c_int32(0)
 """Number of threads of XLA inside the gate."""
@@ -122,8 +124,10 @@ def refusal() -> str | None:
     return f"native loops use version {used} of XLA's foreign function interface, and this jaxlib {provided}"
 
 
-def registered(description: str, key: Hashable, make_handler: Callable[[], Handler]) -> str:
+def registered(description: str, key: Hashable, rank: int, make_handler: Callable[[], Handler]) -> str:
     """Return the name by which `call` reaches the handler for a key; make and register the handler if there is none.
+
+    The rank is the number of axes of the first result, without the axes of batches.
 
     The same description gives the same name in every process, for XLA's compilation cache. If another key already has
     that description, such as a function that was defined again, the name differs. It begins with the first word of the
@@ -135,7 +139,7 @@ def registered(description: str, key: Hashable, make_handler: Callable[[], Handl
             name += "_"
         if name not in _entries:
             # Kept for the life of the process: XLA's programs hold its bare address.
-            entry = _Entry(_entry(make_handler()))
+            entry = _Entry(_entry(_batched(make_handler(), rank)))
             _entries[name] = key, entry
             jax.ffi.register_ffi_target(name, _capsule(_gated(entry)), platform="cpu")
     return name
@@ -144,7 +148,51 @@ def registered(description: str, key: Hashable, make_handler: Callable[[], Handl
 def call(name: str, results: Sequence[tuple[tuple[int, ...], DTypeLike]], *inputs: Array) -> list[Array]:
     """Call a handler of `registered` inside a computation, given the shape and dtype of each result."""
     shapes = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in results]
-    return list(jax.ffi.ffi_call(name, shapes, vmap_method="sequential")(*inputs))
+    return list(jax.ffi.ffi_call(name, shapes, vmap_method="expand_dims")(*inputs))
+
+
+def _batched(handler: Handler, rank: int) -> Handler:
+    """Return a handler that also takes batches: arrays with a further leading axis for every `vmap`, of length 1 where
+    all members share the array. The rank is the one given to `registered`."""
+
+    def of_batch(arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
+        sizes = results[0].shape[: results[0].ndim - rank]
+        members = [
+            ([_member(array, index) for array in arguments], [_member(array, index) for array in results])
+            for index in np.ndindex(sizes)
+        ]
+        num = num_threads()
+        if len(members) < max(2, num):
+            for member in members:
+                handler(*member)
+            return
+        # One iterator for all threads: each one takes the next member when it is done with another.
+        remaining = iter(members)
+
+        def work(*_: int) -> None:
+            _in_batch.is_member = True
+            try:
+                for member in remaining:
+                    handler(*member)
+            finally:
+                _in_batch.is_member = False
+
+        run_spans(work, even_spans(num, 1))
+
+    return of_batch
+
+
+def _member(array: np.ndarray, index: tuple[int, ...]) -> np.ndarray:
+    """Return the array of a member of a batch, given its index along each axis of the batch."""
+    places = (min(k, size - 1) for k, size in zip(index, array.shape, strict=False))
+    # Without the ellipsis, a scalar would be copied.
+    member: np.ndarray = array[(*places, ...)]
+    return member
+
+
+def num_threads() -> int:
+    """Return the number of threads that a handler may use; 1 in a batch whose members threads divide."""
+    return 1 if getattr(_in_batch, "is_member", False) else threads.num_threads()
 
 
 def _capsule(address: int | None, destructor: int | None = None) -> object:

@@ -89,7 +89,8 @@ def _registered(score: Score, dtype: str, name: Literal["score", "pull_back"]) -
 
         return handler
 
-    return ffi.registered(f"ssim {name} {dtype} {function} {score.taps}", (name, dtype, score), make_handler)
+    rank = 1 if name == "score" else 3
+    return ffi.registered(f"ssim {name} {dtype} {function} {score.taps}", (name, dtype, score), rank, make_handler)
 
 
 class _ImageRows(Writer):
