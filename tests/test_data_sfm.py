@@ -482,11 +482,11 @@ def test_an_interrupted_search_says_that_it_begins_again(tmp_path, monkeypatch, 
 
 def test_a_part_of_the_photographs_is_no_success(tmp_path, monkeypatch, capsys):
     (tmp_path / "photos").mkdir()
-    monkeypatch.setattr(sfm, "run_sfm", lambda *_, **__: sfm.SfmSummary(24, 11, 300, 0.5, 640))
+    monkeypatch.setattr(sfm, "run_sfm", lambda *_, **__: sfm.SfmSummary(24, 12, 300, 0.5, 640))
     monkeypatch.setattr("a2tg_jax.results.figures.save_camera_picture", lambda *_: None)
     assert cli.main(["sfm", str(tmp_path / "photos"), str(tmp_path / "scene")]) == 2
     error = capsys.readouterr().err
-    assert "only 11 of 24 photographs have a camera" in error
+    assert "only 12 of 24 photographs have a camera" in error
     assert "To train it all the same: a2tg train" in error
 
 

@@ -15,7 +15,7 @@ from a2tg_jax.host.signals import Stopped
 from a2tg_jax.results.output_paths import check_apart, check_output
 
 LEAST_PLACED = 0.5
-"""Smallest share of the photographs with a camera with which finding cameras counts as successful."""
+"""Share of the photographs that must be exceeded by those with a camera, or the command fails."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,7 +92,7 @@ class Sfm:
         )
         run = ["a2tg", "train", str(out), "--out", f"runs/{out.resolve().name}"]
         command = f"{shlex.join(run)} {quick_flags(summary.longest_side)}"
-        if summary.num_registered < LEAST_PLACED * summary.num_photos:
+        if summary.num_registered <= LEAST_PLACED * summary.num_photos:
             raise ValueError(
                 f"only {summary.num_registered} of {summary.num_photos} photographs have a camera, so that {out} shows "
                 f"less than you photographed; the warnings say what may help. To train it all the same: {command}"
