@@ -479,8 +479,8 @@ def test_items_without_a_terminal_are_counted_in_plain_lines(capsys, monkeypatch
 def test_without_a_terminal_tenths_are_plain_lines(capsys, monkeypatch):
     monkeypatch.setattr(progress_bars, "PLAIN_SECONDS", 0.0)
     with a2tg.ProgressBar("a-stage", 0, 20) as bar:
-        for _ in range(20):
-            bar.update(0.5, 20.0, None, None)
+        for done in range(1, 21):
+            bar.update(done, 0.5, 20.0, None, None)
     lines = capsys.readouterr().err.splitlines()
     assert lines[:2] == ["a-stage: compiling", "a-stage: 2 of 20, loss 0.5000, 20.00 dB"] and len(lines) == 11
 
@@ -499,8 +499,8 @@ def test_in_a_notebook_a_bar_is_one_output(capsys, monkeypatch):
     monkeypatch.setattr(sys, "stderr", stream)
     assert list(progress_bars.progress_over([1, 2, 3], "frames", "frame")) == [1, 2, 3]
     with a2tg.ProgressBar("a-stage", 0, 20) as bar:
-        for _ in range(20):
-            bar.update(0.5, 20.0, None, None)
+        for done in range(1, 21):
+            bar.update(done, 0.5, 20.0, None, None)
     frames, stage = outputs
     assert "| 0/3 " in frames[0] and "| 3/3 " in frames[-1]
     assert "a-stage (compiling)" in stage[0] and "a-stage: 100%" in stage[-1] and "| 20/20 " in stage[-1]

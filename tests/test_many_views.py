@@ -171,7 +171,7 @@ def test_a_call_of_a_batch_has_every_member_once():
 
     def handler(arguments, results):
         x, y = arguments
-        threads.append(ffi.num_threads())
+        threads.append(ffi.threads_of_handler())
         results[0][...] = x + y
         results[1][...] = y.sum()
 
@@ -203,4 +203,4 @@ def test_an_error_in_a_batch_reaches_the_caller():
     batch = jax.vmap(lambda x: ffi.call(name, [((1,), jnp.float32)], x))
     with pytest.raises(jax.errors.JaxRuntimeError, match="the member 2"):
         jax.block_until_ready(batch(jnp.arange(5.0)[:, None]))
-    assert ffi.num_threads() == 2
+    assert ffi.threads_of_handler() == 2

@@ -514,7 +514,8 @@ def test_a_signal_in_training_keeps_its_state(scene, stopped, tmp_path, monkeypa
     printed = capsys.readouterr().err.splitlines()[-1]
     assert printed == (
         f"a2tg: interrupted; the last checkpoint is {run.checkpoint(NAME, 7)}; "
-        f"show it with: a2tg view {out} --model {NAME}; continue with: a2tg train --out {out} --resume"
+        f"show it with: a2tg view {out} --model {NAME}; continue with: a2tg train --out {out} --resume "
+        "(add --finish-now to finish soon)"
     )
     train_run(run, scene, QUIET)
     assert_same(run, stopped[1])

@@ -113,7 +113,7 @@ def _parts(starts: np.ndarray) -> list[ffi.Span]:
     """
     num_items = len(starts) - 1
     num_pairs = int(starts[-1])
-    count = max(1, min(ffi.num_threads(), num_pairs // PAIRS_PER_THREAD))
+    count = max(1, min(ffi.threads_of_handler(), num_pairs // PAIRS_PER_THREAD))
     # A tile counts one more than its pairs, so that tiles without pairs are divided as well.
     work = starts.astype(np.int64) + np.arange(num_items + 1)
     borders = np.searchsorted(work, np.linspace(0, work[-1], count + 1)[1:-1]).tolist()

@@ -161,7 +161,7 @@ def _batched(handler: Handler, rank: int) -> Handler:
             ([_member(array, index) for array in arguments], [_member(array, index) for array in results])
             for index in np.ndindex(sizes)
         ]
-        num = num_threads()
+        num = threads_of_handler()
         if len(members) < max(2, num):
             for member in members:
                 handler(*member)
@@ -190,7 +190,7 @@ def _member(array: np.ndarray, index: tuple[int, ...]) -> np.ndarray:
     return member
 
 
-def num_threads() -> int:
+def threads_of_handler() -> int:
     """Return the number of threads that a handler may use; 1 in a batch whose members threads divide."""
     return 1 if getattr(_in_batch, "is_member", False) else threads.num_threads()
 
@@ -314,7 +314,7 @@ def _arrays(buffers: Any) -> list[np.ndarray]:
 
 def even_spans(num: int, least_items: int) -> list[Span]:
     """Split 0..num into even spans, one per thread, of at least `least_items` each if there is more than one."""
-    count = max(1, min(num_threads(), num // max(1, least_items)))
+    count = max(1, min(threads_of_handler(), num // max(1, least_items)))
     return list(itertools.pairwise(num * k // count for k in range(count + 1)))
 
 
@@ -323,7 +323,7 @@ def run_spans(work: Callable[[int, int, int], None], spans: Sequence[Span]) -> N
     futures: list[concurrent.futures.Future[None]] = []
     try:
         for index, span in enumerate(spans[1:], start=1):
-            futures.append(_pool(num_threads()).submit(work, *span, index))
+            futures.append(_pool(threads_of_handler()).submit(work, *span, index))
         work(*spans[0], 0)
     finally:
         # Also after an exception: nobody may write to XLA's buffers once they are given back.
