@@ -8,7 +8,7 @@ from pathlib import Path
 class Demo:
     """Train the built-in synthetic scene with and without textures.
 
-    Takes about two minutes on two cores. Open runs/demo/report.html for the results.
+    Takes one to two minutes on two cores. Open runs/demo/report.html for the results.
     """
 
     out: Path = Path("runs/demo")
