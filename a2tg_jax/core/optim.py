@@ -3,6 +3,7 @@
 jaxopt has no Adam. No other module imports jaxopt.
 """
 
+import functools
 import math
 import warnings
 from typing import Any
@@ -116,14 +117,19 @@ def adam_update(
         change: Array = rate / first * (m / (root + eps))
         return param - change
 
+    params = jax.tree.map(step, _rate_of_each(rates, params), params, mu, nu)
+    return _opt_step()(params=params, state=AdamState(mu, nu, count))
+
+
+@functools.cache
+def _opt_step() -> Any:
+    """Return jaxopt's `OptStep`. jaxopt is imported once, at the first step: it brings SciPy's optimisers, a quarter of
+    the time of importing this package."""
     with warnings.catch_warnings():
-        # jaxopt warns at import that it is no longer maintained, about which users of this package can do nothing. It
-        # is imported here because it brings SciPy's optimisers, a quarter of the time of importing this package.
+        # jaxopt warns at import that it is no longer maintained, about which users of this package can do nothing.
         warnings.filterwarnings("ignore", message="JAXopt is no longer maintained", category=DeprecationWarning)
         from jaxopt import OptStep  # type: ignore[import-untyped]
-
-    params = jax.tree.map(step, _rate_of_each(rates, params), params, mu, nu)
-    return OptStep(params=params, state=AdamState(mu, nu, count))
+    return OptStep
 
 
 def exponential_decay(start: float, final_factor: float, iteration: Array | int, total: int) -> Array:

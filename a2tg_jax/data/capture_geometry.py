@@ -106,11 +106,16 @@ def without_outlying(cameras: Sequence[Camera]) -> list[Camera]:
     return [camera for camera, is_far in zip(cameras, is_outlying, strict=True) if not is_far]
 
 
+def perpendicular(direction: np.ndarray) -> np.ndarray:
+    """Return a vector [3] perpendicular to a direction [3], not of unit length."""
+    return np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
+
+
 def largest_gap(viewmats: np.ndarray, up: np.ndarray) -> float:
     """Return the largest angle in radians, at the subject and about the vertical `up` [3], without a camera [V, 4, 4];
     2π with one camera."""
     offsets = camera_centers(viewmats) - subject_of(viewmats)
-    side = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    side = perpendicular(up)
     angles = np.sort(np.arctan2(offsets @ np.cross(up, side), offsets @ side))
     return float(np.diff(angles, append=angles[0] + 2 * np.pi).max())
 

@@ -1,6 +1,7 @@
 """Structure from motion for plain photographs, videos and panoramas: COLMAP's features, matching and mapping."""
 
 import itertools
+import math
 import os
 import re
 import shutil
@@ -13,7 +14,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image
-from scipy.ndimage import laplace
 
 from a2tg_jax.base.checks import check_literal
 from a2tg_jax.base.regular_files import expanded
@@ -30,6 +30,7 @@ from a2tg_jax.data.photo_folder import LEAST_PHOTOS
 from a2tg_jax.data.photo_reading import HALF, MASKS
 from a2tg_jax.data.sfm_options import DEFAULT_FRAMES, CameraModel, Matching, Panorama
 from a2tg_jax.data.staging import Staged, directions, stage
+from a2tg_jax.data.video import sharpness
 from a2tg_jax.host.progress_bars import clock, counting, ticking
 
 MAX_EXHAUSTIVE = 200
@@ -332,17 +333,17 @@ def _read_matches(database: Path) -> Matches:
 def blurred_photos(folder: Path, names: Sequence[str]) -> tuple[str, ...]:
     """Return the names of the photographs, of one scene, that are much less sharp than the others, sorted."""
 
-    def sharpness(name: str) -> float:
+    def contrast(name: str) -> float:
         """Standard deviation of the Laplacian of a small greyscale copy."""
         with Image.open(folder / name) as photo:
             photo.draft("L", (SHARPNESS_SIDE, SHARPNESS_SIDE))
             small = photo.convert("L")
             small.thumbnail((SHARPNESS_SIDE, SHARPNESS_SIDE), Image.Resampling.BOX)
-            return float(laplace(np.asarray(small, np.float32)).std())
+            return math.sqrt(sharpness(np.asarray(small)))
 
     if not names:
         return ()
-    found = np.array(map_in_threads(sharpness, names))
+    found = np.array(map_in_threads(contrast, names))
     is_blurred = found < BLURRED * np.quantile(found, SHARP_QUANTILE)
     return tuple(sorted(name for name, is_one in zip(names, is_blurred, strict=True) if is_one))
 

@@ -49,15 +49,14 @@ def extract_frames(video: Path, folder: Path, count: int, *, progress: bool = Tr
       (number written, number of frames of the video).
     """
     stream, size = _chosen_stream(video)
-    sharpness = []
+    scores = []
     places = []
     path = 0.0
     seen = None  # The last frame that moved, so that slow motion adds up.
     is_interlaced = False
     for frame in _frames(video, stream, "scoring frames", progress):
         is_interlaced |= bool(frame.interlaced_frame)
-        # Sharpness is the variance of the Laplacian.
-        sharpness.append(float(laplace(_grey(frame, SHARPNESS_WIDTH).astype(np.float32)).var()))
+        scores.append(sharpness(_grey(frame, SHARPNESS_WIDTH)))
         small = _grey(frame, MOTION_WIDTH)
         moved = LEAST_MOTION if seen is None else motion(seen, small)
         if moved >= LEAST_MOTION:
@@ -69,7 +68,7 @@ def extract_frames(video: Path, folder: Path, count: int, *, progress: bool = Tr
     if is_interlaced:
         advice = _conversion(video, "-vf bwdif")
         warnings.warn(f"{video}: is interlaced, so that moving edges look like combs; {advice}", stacklevel=2)
-    chosen = set(choose_frames(np.array(sharpness), np.array(places), count).tolist())
+    chosen = set(choose_frames(np.array(scores), np.array(places), count).tolist())
     folder.mkdir(parents=True)
     # Decoded again, because all frames would not fit into memory.
     for number, frame in enumerate(_frames(video, stream, "writing frames", progress)):
@@ -80,6 +79,11 @@ def extract_frames(video: Path, folder: Path, count: int, *, progress: bool = Tr
             pixels = _as_shown(frame.to_ndarray(format="rgb24"), matrix)
             Image.fromarray(np.ascontiguousarray(pixels)).save(folder / f"{number:06d}.jpg", quality=QUALITY)
     return len(chosen), len(places)
+
+
+def sharpness(grey: np.ndarray) -> float:
+    """Return the sharpness of a small greyscale picture [h, w], the variance of its Laplacian."""
+    return float(laplace(grey.astype(np.float32)).var())
 
 
 def choose_frames(sharpness: np.ndarray, places: np.ndarray, count: int) -> np.ndarray:

@@ -108,6 +108,8 @@ def gaussians_at_errors(model: Model, due: Due, num: int) -> Gaussians:
     Raises:
       ValueError: if there are no views.
     """
+    from scipy.spatial.transform import Rotation  # Not at import of the package, which would take 0.2 s longer.
+
     views = evenly_chosen(due.views, MOST_VIEWS)
     settings = due.render_settings(model, views)
     rng = np.random.default_rng((due.seed, due.index))
@@ -128,8 +130,6 @@ def gaussians_at_errors(model: Model, due: Due, num: int) -> Gaussians:
     view_of = rng.choice(len(totals), num, p=np.asarray(totals) / sum(totals))
     # Each Gaussian takes a pixel of a view that is drawn by its share of the error; every view has drawn `num` pixels.
     chosen = [np.stack(column)[view_of, np.arange(num)] for column in zip(*drawn, strict=True)]
-    from scipy.spatial.transform import Rotation  # Not at import of the package, which would take 0.2 s longer.
-
     points, normals, colors, sizes = chosen
     arrays = (
         points,

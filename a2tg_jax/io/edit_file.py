@@ -18,7 +18,7 @@ from a2tg_jax.core.similarity import check_similarity
 from a2tg_jax.io.columns import AxisSteps
 from a2tg_jax.io.floaters import floater_scores
 from a2tg_jax.io.saved_file import VERSION, load_saved
-from a2tg_jax.io.subject import find_subject
+from a2tg_jax.io.subject import Subject, find_subject
 
 # As in web/src/extent.ts.
 PERCENTILES_PER_SPREAD = 1.2
@@ -175,12 +175,17 @@ def apply_edit(model: Model, edit: Edit) -> Model:
     Raises:
       ValueError: if no Gaussian would be left, or the model has no subject.
     """
+    return apply_with_subject(model, edit, find_subject(model) if edit.subject else None)
+
+
+def apply_with_subject(model: Model, edit: Edit, subject: Subject | None) -> Model:
+    """Return an edited model as `apply_edit`, given its subject; None: the edit keeps more than that."""
     model = model.live
     is_kept = np.ones(model.num, bool)
     if edit.floaters > 0:
         is_kept &= scores_of(model) <= largest_score(edit.floaters)
-    if edit.subject:
-        is_kept &= find_subject(model).is_kept
+    if subject is not None:
+        is_kept &= subject.is_kept
     if edit.crop is not None:
         places = np.asarray(model.gaussians.means, np.float64) @ edit.crop.axes.T
         is_kept &= ((places >= edit.crop.low) & (places <= edit.crop.high)).all(axis=1)

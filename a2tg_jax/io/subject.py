@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from a2tg_jax import Model, Origin
 from a2tg_jax.base.even_spacing import evenly_chosen
-from a2tg_jax.data.capture_geometry import LEAST_FACING, camera_centers, outlying_cameras
+from a2tg_jax.data.capture_geometry import LEAST_FACING, camera_centers, outlying_cameras, perpendicular
 from a2tg_jax.io.columns import opacities_of
 
 FEWEST_CAMERAS = 3
@@ -84,7 +84,7 @@ class Subject(NamedTuple):
     around it in which its floor or wall continues, of its distance from the cameras that is free, of what holds it
     together that the seam leaves, and of what stays the same with other thresholds."""
     check: str
-    """What made that share the smallest, and what to check."""
+    """Why that share is small, and what to check."""
 
     @property
     def words(self) -> str:
@@ -217,7 +217,7 @@ def _frame_of(origin: Origin | None) -> _Frame:
             "way; crop the model instead"
         )
     up = origin.vertical
-    across = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    across = perpendicular(up)
     across /= np.linalg.norm(across)
     axes = np.stack([across, np.cross(up, across), up])
     return _Frame(axes, point, distance, (centers - point) @ axes.T / distance, directions @ axes.T)
@@ -269,7 +269,7 @@ def _largest_plane(
     normals *= np.sign(normals @ frame.centers.mean(axis=0))[:, None]
     offsets = np.sum(normals * corners[:, 0], axis=1)
     is_before = np.mean(frame.centers @ normals.T > offsets, axis=0) > LEAST_BEFORE
-    # A flat subject is hardly above its floor; but a wall on which nothing is may be the subject itself.
+    # A flat subject is barely above its floor. A wall close to the point may be the subject itself.
     is_floor = normals[:, 2] > np.cos(LARGEST_TILT)
     is_under = offsets < np.where(is_floor, FLATNESS, -LEAST_DEPTH)
     # A second floor is the top of something.
@@ -301,7 +301,7 @@ def _largest_plane(
 
 def _sectors_of(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Return the numbers of the sectors [P], about a normal, in which points [P, 3] are."""
-    first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    first = perpendicular(normal)
     angles = np.arctan2(points @ np.cross(normal, first), points @ first) / (2 * np.pi)
     return (angles % 1 * NUM_SECTORS).astype(int) % NUM_SECTORS
 

@@ -188,9 +188,10 @@ def extract_mesh(
             for grid, space in zip(grids, spaces, strict=True):
                 fuse(grid, depths, space)
             seen.append(_sampled(depths, spaces[0], MOST_SAMPLED // len(cameras)))
-        least_weights = [least_weight, *[max(least_weight, LEAST_TO_FILL)] * (len(grids) - 1)]
+        least_of_coarse = max(least_weight, LEAST_TO_FILL)
         for level in reversed(range(len(grids) - 1)):
-            fill(grids[level], grids[level + 1], *least_weights[level : level + 2])
+            least = least_of_coarse if level else least_weight
+            fill(grids[level], grids[level + 1], least, least_of_coarse)
     except GridFullError:
         raise GridFullError(
             f"a resolution of {radius / voxel:.0f} voxels along the radius takes more than {max_bytes / 1e9:.3g} GB: "

@@ -10,7 +10,7 @@ from PIL import ImageColor
 from a2tg_jax import Model, Origin
 from a2tg_jax.base.text import did_you_mean
 from a2tg_jax.core.origin import Color
-from a2tg_jax.io.edit_file import Edit, apply_edit, crop_box, save_edit
+from a2tg_jax.io.edit_file import Edit, apply_with_subject, crop_box, save_edit
 from a2tg_jax.io.subject import find_subject
 from a2tg_jax.results.conversion import check_conversion, write_converted
 from a2tg_jax.results.model_source import open_source
@@ -53,8 +53,9 @@ def write_edit(
         check_conversion(source, out, PlacementOptions(), overwrite=overwrite)
     opened = open_source(source, name)
     edit = edit_of(options, opened.model)
-    edited = apply_edit(opened.model, edit)
-    note = f"\nsubject: {find_subject(opened.model).words}" if edit.subject else ""
+    subject = find_subject(opened.model) if edit.subject else None
+    edited = apply_with_subject(opened.model, edit, subject)
+    note = "" if subject is None else f"\nsubject: {subject.words}"
     if not is_edit:
         return write_converted(opened.path, edited, out, start, PlacementOptions()) + note
     save_edit(out, edit)

@@ -20,6 +20,7 @@ from a2tg_jax import Camera, History, Model, Renderer, RenderOutput, RenderSetti
 from a2tg_jax.base.atomic import replacing
 from a2tg_jax.base.text import PROGRAM
 from a2tg_jax.core.sh import SH_C0
+from a2tg_jax.data.capture_geometry import perpendicular
 from a2tg_jax.data.colmap import read_cameras_and_points
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.images import checkered, save_picture, to_uint8
@@ -304,7 +305,7 @@ def save_camera_picture(scene: Path, path: Path) -> None:
     right = rotations[:, 0].mean(axis=0)
     right = right - up * (right @ up)
     if np.linalg.norm(right) < 1e-6:  # Cameras in a ring have no common right side.
-        right = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+        right = perpendicular(up)
     right = right / np.linalg.norm(right)
     axes = np.stack([right, np.cross(up, right), up])
     middle = np.median(np.concatenate([centers, cloud.points]), axis=0)

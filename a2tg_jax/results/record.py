@@ -123,10 +123,11 @@ class RunRecord:
         if self.init is not None and len(self.plan.main) < 2:
             raise ValueError(f"init replaces a first stage, and {self.system} has no second one")
         for name, iteration in self.shortened_at.items():
-            if name not in self.plan.names or not 0 <= iteration <= self.plan[name].stage.iterations:
+            plan = self.plan
+            if name not in plan.names or not 0 <= iteration <= plan[name].stage.iterations:
                 raise ValueError(
                     f"shortened_at.{shortened(name)} must be an iteration of a stage of the run "
-                    f"({', '.join(self.plan.names)}); got {iteration}: remove it to train the stage as planned"
+                    f"({', '.join(plan.names)}); got {iteration}: remove it to train the stage as planned"
                 )
 
     @property

@@ -178,15 +178,14 @@ def how_to_go_on(run: RunFolder, devices: Devices | None = None) -> str:
     """Return the newest file of the training and the command that shows it, and the command that resumes, as
     `resuming_command`, with the flag that finishes soon."""
     kept = "there is no checkpoint yet"
-    has_begun = False
+    hint = ""
     for name in read_record(run).plan.names:
         path = run.newest(name)
         if path is not None:
-            has_begun = True
+            hint = " (add --finish-now to finish soon)"
             what = "model" if path == run.model(name) else "checkpoint"
             kept = f"the last {what} is {path}; show it with: {viewing_command(run, name)}"
-    command = f"{kept}; continue with: {resuming_command(run, devices)}"
-    return f"{command} (add --finish-now to finish soon)" if has_begun else command
+    return f"{kept}; continue with: {resuming_command(run, devices)}{hint}"
 
 
 def _write_file(run: RunFolder, record: RunRecord, max_bytes: int, scene: Scene, options: RunOptions) -> None:

@@ -349,13 +349,9 @@ class StageRun:
 
     # Steps
 
-    def is_shortened_after(self, iteration: int) -> bool:
-        """Return whether the steps after an iteration are the ones of a shortened stage."""
-        return self.shortened_at is not None and iteration >= self.shortened_at
-
     def stride_after(self, iteration: int) -> int:
         """Return the number of iterations that a step after an iteration counts as."""
-        if self.shortened_at is None or not self.is_shortened_after(iteration):
+        if self.shortened_at is None or iteration < self.shortened_at:
             return 1
         left = self.stage.iterations - self.shortened_at
         return math.ceil(left / max(LEAST_SHORTENED, SHORTENED * left))
@@ -476,7 +472,8 @@ class StageRun:
         for place, (event, times) in enumerate(zip(self.stage.events, self.stage.times, strict=True)):
             if isinstance(event, HostEvent) and iteration in times:
                 self._apply(place, event, times.index(iteration) + 1, len(times))
-            if iteration == self._last_gathered[place] and not self.is_shortened_after(iteration):
+            # In a shortened stage it is not worth compiling a step without the statistic.
+            if iteration == self._last_gathered[place] and self.stride_after(iteration) == 1:
                 self._keep(place, None)
         self.state = divided(self.mesh, self.state)
 

@@ -25,7 +25,7 @@ function pixel(point: Vec3): Vec3 {
 }
 
 describe("the box of a crop", () => {
-  test("has the faces that cut, and those of the sliders' ends", () => {
+  test("has the faces that cut, and the faces at the sliders' ends", () => {
     const box = boxOf(EXTENT, UP, CROP);
     const clip = clipOf(EXTENT, UP, CROP, 0);
     expect([box.axes, box.low, box.high]).toEqual([clip.axes, clip.low, clip.high]);
