@@ -97,6 +97,7 @@ def x64():
 def threads(monkeypatch):
     """Neither `set_num_threads` nor the environment has set a number of threads, nor does the test's stay."""
     monkeypatch.delenv("A2TG_NUM_THREADS", raising=False)
+    set_num_threads(None)
     yield
     set_num_threads(None)
 
