@@ -342,7 +342,6 @@ import logging, jax
 from a2tg_jax.host import startup
 before = jax.config.values["jax_logging_level"], logging.getLogger("jax").level
 startup.configure_cpu()
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.jit(lambda x: jax.numpy.sort(x) @ x)(jax.numpy.ones((9, 9))).block_until_ready()
 assert (jax.config.values["jax_logging_level"], logging.getLogger("jax").level) == before
 print("kept" if jax.config.values["jax_compilation_cache_dir"] else "no cache")

@@ -108,11 +108,14 @@ def _lists_on(platform: str, compositor: CompositorChoice, near_plane: float, gr
 
 
 def _forward(settings: PassSettings, inputs: PassInputs, jacobian: Array, probe: Array) -> tuple[Array, Array]:
-    """Return channels [tiles, D, P] and transmittance [tiles, P]; jacobian and probe are for the backward pass."""
+    """Return channels [tiles, D, P] and transmittance [tiles, P]; jacobian and probe are for the backward pass.
+
+    The statistic is as well: without it, the kernel is the same in training and afterwards.
+    """
     tiles = settings.grid.num
     shapes = (tiles, settings.num_channels, settings.num_pixels), (tiles, settings.num_pixels)
     results = tuple(jax.ShapeDtypeStruct(shape, inputs.splats.M.dtype) for shape in shapes)
-    return _by_platform("forward", settings, results, inputs)
+    return _by_platform("forward", settings._replace(statistic=None), results, inputs)
 
 
 _composite_tiles = jax.custom_vjp(_forward, nondiff_argnums=(0,))
@@ -152,7 +155,7 @@ def _by_platform(name: str, settings: PassSettings, results: Any, *arrays: objec
 
 def _pass_on(platform: str, name: str, settings: PassSettings) -> Any:
     kernels = _kernels(settings.compositor, platform)
-    reason = None if kernels is xla else kernels.refusal(settings.kernel_settings)
+    reason = None if kernels is xla else kernels.refusal(name, settings.kernel_settings)
     if reason:
         instead_of(settings.compositor, type(settings.static.appearance), reason)
         kernels = xla

@@ -181,15 +181,27 @@ class PixelFunctions:
         self.prepare, structure = trace(pixel.planes_of, splat.M, tile)
         self.num_planes = structure.num_leaves
         planes = jax.tree.unflatten(structure, [number] * structure.num_leaves)
-        self.prepare_vjp, _ = trace(_planes_vjp, splat.M, tile, planes)
         outline = Outline._make([number] * (len(Outline._fields) - 1) + [flag])
         self.touches, _ = trace(outline_touches, outline, *(number,) * 4)
         self.reach, _ = trace(self._reach, planes, region, number, number)
         at_pixel = (number, number, number, flag)
         channels = (number,) * settings.num_channels
-        self.forward, _ = trace(self._forward, planes, splat, values, *at_pixel, channels)
-        of_backward = number, channels, tile, (triple,) * 3
-        self.backward, _ = trace(self._backward, planes, splat, lookup, *at_pixel, *of_backward)
+        self._of_vjp = splat.M, tile, planes
+        self._of_forward = planes, splat, values, *at_pixel, channels
+        self._of_backward = planes, splat, lookup, *at_pixel, number, channels, tile, (triple,) * 3
+
+    # Of these a pass uses one or two.
+    @functools.cached_property
+    def prepare_vjp(self) -> core.ClosedJaxpr:
+        return trace(_planes_vjp, *self._of_vjp)[0]
+
+    @functools.cached_property
+    def forward(self) -> core.ClosedJaxpr:
+        return trace(self._forward, *self._of_forward)[0]
+
+    @functools.cached_property
+    def backward(self) -> core.ClosedJaxpr:
+        return trace(self._backward, *self._of_backward)[0]
 
     def _reach(
         self, planes: pixel.Planes, region: TextureRegion | None, x: Array, y: Array

@@ -27,8 +27,8 @@ DEFAULT_CAPABILITY = "9.0"
 
 
 @functools.cache
-def refusal(kernel: PassSettings) -> str | None:
-    """Return why an appearance cannot run in GPU kernels; None if it can."""
+def refusal(_: str, kernel: PassSettings) -> str | None:
+    """Return why an appearance cannot run in GPU kernels; None if it can. Both passes are one source."""
     if kernel.has_rays:
         return "CUDA kernels do not draw cameras with rays"
     return refusal_of(kernel, functools.partial(source, dialect="cuda"))

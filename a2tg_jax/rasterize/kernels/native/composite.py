@@ -18,7 +18,7 @@ from a2tg_jax.rasterize.kernels.jaxprs import refusal_of
 from a2tg_jax.rasterize.kernels.native import ffi
 from a2tg_jax.rasterize.kernels.native.lists import list_functions
 from a2tg_jax.rasterize.kernels.native.llvm_code import CompiledFunction
-from a2tg_jax.rasterize.kernels.native.passes import compiled_passes, packed_outlines, packed_pixels
+from a2tg_jax.rasterize.kernels.native.passes import compiled_pass, packed_outlines, packed_pixels
 from a2tg_jax.rasterize.splats import PassInputs, PassSettings, Splats, pack_inputs, unpack_gradients
 from a2tg_jax.rasterize.tiles import TileGrid, TileLists
 
@@ -31,9 +31,9 @@ ROWS_PER_THREAD = 2_000
 
 
 @functools.cache
-def refusal(kernel: PassSettings) -> str | None:
-    """Return why an appearance cannot run in native loops; None if it can, after compiling them."""
-    return refusal_of(kernel, compiled_passes)
+def refusal(name: Literal["forward", "backward"], kernel: PassSettings) -> str | None:
+    """Return why a pass of an appearance cannot run in native loops; None if it can, after compiling it."""
+    return refusal_of(kernel, functools.partial(compiled_pass, name))
 
 
 def forward(settings: PassSettings, inputs: PassInputs) -> tuple[Array, Array]:
@@ -69,7 +69,7 @@ def _registered(
 ) -> str:
     description = f"compositor=native {name} {kernel!r}"
     rank = 3 if name == "forward" else 2
-    return ffi.registered(description, (name, kernel), rank, lambda: make_handler(compiled_passes(kernel)[name]))
+    return ffi.registered(description, (name, kernel), rank, lambda: make_handler(compiled_pass(name, kernel)))
 
 
 def _forward_handler(run: CompiledFunction) -> ffi.Handler:

@@ -48,6 +48,13 @@ def suffix(type_: ir.Type) -> str:
     return f"v{type_.count}{scalar}" if isinstance(type_, ir.VectorType) else scalar
 
 
+@functools.cache
+def _constant(number: str, scalar: ir.Type, width: int) -> ir.Constant:
+    """Return a number in every lane; as a text it keeps the sign of zero. Making the text of a vector takes long."""
+    value = float(number) if is_float(scalar) else int(number)
+    return ir.Constant(scalar, value) if width == 1 else ir.Constant(ir.VectorType(scalar, width), [value] * width)
+
+
 class Lanes:
     """Operations at a builder's position on vectors of `width` lanes; `width` 1 means plain scalars."""
 
@@ -76,7 +83,7 @@ class Lanes:
     def constant(self, value: Any, scalar: ir.Type) -> ir.Constant:
         """Return the same number in every lane."""
         value = float(value) if is_float(scalar) else int(value)
-        return ir.Constant(self.vector(scalar), value if self.width == 1 else [value] * self.width)
+        return _constant(str(value), scalar, self.width)
 
     def broadcast(self, value: ir.Value) -> ir.Value:
         """Copy a scalar to every lane."""

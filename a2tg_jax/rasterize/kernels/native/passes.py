@@ -18,7 +18,7 @@ more_splats and more_probe, and to more_texels from texel more_first[k] on.
 import contextlib
 import functools
 from collections.abc import Iterator, Sequence
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -569,13 +569,13 @@ class _Backward(_Pass):
 
 
 @functools.cache
-def compiled_passes(kernel: PassSettings) -> dict[str, CompiledFunction]:
-    """Return the passes `forward` and `backward` of a kernel, compiled at the first call."""
-    functions = PixelFunctions(kernel)
-    module = ir.Module("passes")
-    forward = llvm_code.unique("forward")
-    backward = llvm_code.unique("backward")
-    _Forward(functions, module, forward, FORWARD).write()
-    _Backward(functions, module, backward, BACKWARD).write()
-    signatures = {forward: (len(FORWARD), len(INTEGERS)), backward: (len(BACKWARD), len(INTEGERS))}
-    return dict(zip(("forward", "backward"), llvm_code.compiled(module, signatures), strict=True))
+def compiled_pass(name: Literal["forward", "backward"], kernel: PassSettings) -> CompiledFunction:
+    """Return a pass of a kernel, compiled at the first call."""
+    module = ir.Module(name)
+    writers: dict[str, tuple[type[_Forward] | type[_Backward], tuple[str, ...]]]
+    writers = {"forward": (_Forward, FORWARD), "backward": (_Backward, BACKWARD)}
+    writer, buffers = writers[name]
+    function = llvm_code.unique(name)
+    writer(PixelFunctions(kernel), module, function, buffers).write()
+    (compiled,) = llvm_code.compiled(module, {function: (len(buffers), len(INTEGERS))})
+    return compiled
