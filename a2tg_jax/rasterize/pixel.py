@@ -114,6 +114,18 @@ def _larger(x: Array, y: Array) -> Array:
     return jnp.where(x > y, x, y)
 
 
+@jax.custom_jvp
+def _inverse(x: Array) -> Array:
+    """Return 1/x, whose derivative divides no second time."""
+    return 1 / x
+
+
+@_inverse.defjvp
+def _inverse_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    inverse = _inverse(primals[0])
+    return inverse, -(inverse * inverse) * tangents[0]
+
+
 def intersect(planes: Planes, x: Array, y: Array, near_plane: float, has_low_pass: bool = True) -> Hit:
     """Return the hit of a pixel's ray, or the low-pass filter's if that is nearer (2DGS, equations 10, 11).
 
@@ -129,7 +141,7 @@ def intersect(planes: Planes, x: Array, y: Array, near_plane: float, has_low_pas
     least = jnp.maximum(least, tiny)
     is_far = jnp.abs(q2) <= least
     is_parallel = q2 == 0
-    inverse = 1 / jnp.where(is_far, jnp.where(q2 < 0, -least, least), p2)
+    inverse = _inverse(jnp.where(is_far, jnp.where(q2 < 0, -least, least), p2))
     depth = planes.determinant * inverse
     is_hit = ~is_parallel & (depth >= near_plane)
     u = jnp.where(is_hit, p0 * inverse, 0.0)
