@@ -285,6 +285,14 @@ def test_a_mesh_says_how_much_of_the_views_it_lacks(model):
     assert part.missing > 0.02
 
 
+def test_a_grid_alone_has_the_whole_budget(model):
+    num_bytes = a2tg.extract_mesh(model, resolution=40, fill_holes=False).num_bytes
+    fits = a2tg.extract_mesh(model, resolution=40, fill_holes=False, max_bytes=num_bytes)
+    assert fits.num_bytes == num_bytes
+    with pytest.raises(ValueError, match="takes more than"):
+        a2tg.extract_mesh(model, resolution=40, fill_holes=False, max_bytes=num_bytes - 1)
+
+
 def test_default_voxels_are_no_smaller_than_pixels(model):
     camera = model.origin.cameras[0]
     distance = np.linalg.norm(np.asarray(camera.center))
