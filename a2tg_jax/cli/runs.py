@@ -228,10 +228,10 @@ class MeshCommand:
         check_options(self.options, out)
         files = mesh_files(out, has_texture=self.options.texture != "none")
         check_not_source(files, self.source, "--out")
-        source = open_source(self.source, self.model, self.edit)
         check_output(out)
         for file in files:
             check_export(file, default, "--out", overwrite=self.overwrite)
+        source = open_source(self.source, self.model, self.edit)
         if is_run and out.resolve() == default.resolve():
             # Listed, so that the next a2tg mesh may replace it (check_export).
             RunFolder(self.source).own(default)
