@@ -158,6 +158,22 @@ def test_an_edit_from_flags(tmp_path, capsys):
     np.testing.assert_allclose(model.origin.transform.inverse().rotation @ edit.up, [0, -1, 0], atol=1e-12)
 
 
+def test_a_file_for_programs_that_show_spz_upside_down(tmp_path, capsys):
+    """The opposite vertical turns it half over, so that its +y is up."""
+    turn = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # +z is up in the model's world, −y in the original one.
+    a2tg.save_model(tmp_path / "m.npz", captured(Similarity(2.0, turn, np.ones(3))))
+    assert main(["convert", str(tmp_path / "m.npz"), str(tmp_path / "a.spz")]) == 0
+    assert "upright with +y down, which is the original one" in capsys.readouterr().out
+    assert main(["edit", str(tmp_path / "m.npz"), "--out", str(tmp_path / "b.spz"), "--upright=y"]) == 0
+    usual, other = (np.asarray(a2tg.load_splats(tmp_path / name).gaussians.means) for name in ("a.spz", "b.spz"))
+    by_height = np.argsort(usual[:, 1])
+    against_height = np.argsort(-other[:, 1])
+    np.testing.assert_allclose(other[against_height, 1], -usual[by_height, 1], atol=1e-3)
+    # A turn about x and one about the vertical, no mirror image.
+    turned, distance = Rotation.align_vectors(usual[by_height], other[against_height])
+    assert distance < 0.02 and turned.magnitude() == pytest.approx(np.pi, abs=1e-3)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

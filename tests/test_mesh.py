@@ -167,7 +167,8 @@ def test_files_are_read_back_by_another_library(sphere, tmp_path, suffix):
     placed = upright(similarity, "y").apply(sphere.vertices)
     wanted = placed if suffix == ".glb" else similarity.inverse().apply(sphere.vertices)
     np.testing.assert_allclose(read.vertices, wanted, atol=1e-5)
-    if suffix == ".ply":
+    if suffix != ".glb":  # trimesh shows no vertex colours of a mesh with a material.
+        assert read.visual.kind == "vertex"
         np.testing.assert_array_equal(read.visual.vertex_colors[:, :3], sphere.colors)
 
 
@@ -283,6 +284,14 @@ def test_a_mesh_says_how_much_of_the_views_it_lacks(model):
     assert whole.missing < 0.01
     assert part.mesh.area < 0.95 * whole.mesh.area
     assert part.missing > 0.02
+
+
+def test_a_grid_alone_has_the_whole_budget(model):
+    num_bytes = a2tg.extract_mesh(model, resolution=40, fill_holes=False).num_bytes
+    fits = a2tg.extract_mesh(model, resolution=40, fill_holes=False, max_bytes=num_bytes)
+    assert fits.num_bytes == num_bytes
+    with pytest.raises(ValueError, match="takes more than"):
+        a2tg.extract_mesh(model, resolution=40, fill_holes=False, max_bytes=num_bytes - 1)
 
 
 def test_default_voxels_are_no_smaller_than_pixels(model):
@@ -453,6 +462,7 @@ def test_textures_are_read_back_by_another_library(textured, tmp_path, suffix):
     trimesh = pytest.importorskip("trimesh", reason="trimesh reads the files back: pip install trimesh")
     files = a2tg.save_mesh(tmp_path / f"mesh{suffix}", textured)
     read = trimesh.load(files[0], force="mesh", process=False)
+    assert read.visual.kind == "texture"
     material = read.visual.material
     picture = material.baseColorTexture if suffix == ".glb" else material.image
     np.testing.assert_allclose(read.visual.uv, textured.uv, atol=1e-5)

@@ -755,6 +755,18 @@ def test_a_checkpoint_is_a_model_for_every_command(scene, stopped, tmp_path, cap
     assert_same(run, stopped[1])
 
 
+def test_a_checkpoint_by_its_own_path_says_which_folder_to_give(stopped, tmp_path, capsys):
+    run = stopped[0]
+    newest = run.checkpoints(NAME)[-1]
+    page = ["--web", str(tmp_path / "page")]
+    for words in (["view"], ["render"], ["info"], ["eval"], ["export", *page]):
+        assert cli.main([words[0], str(newest), *words[1:]]) == 2
+        error = capsys.readouterr().err
+        assert f"give its run folder, {run.path}\n" in error or f"is in the run folder {run.path}; give" in error
+        assert cli.main([words[0], str(newest.parent), *words[1:]]) == 2
+        assert f"is in the run folder {run.path}; give that folder" in capsys.readouterr().err
+
+
 def test_an_older_checkpoint_is_shown_if_the_newest_is_damaged(stopped, tmp_path):
     run = RunFolder(shutil.copytree(stopped[0].path, tmp_path / "run"))
     *oldest, older, newest = run.checkpoints(NAME)

@@ -278,7 +278,6 @@ def a_model():
 def test_files_are_not_replaced_without_a_flag(tmp_path, monkeypatch, capsys, words, mine, message):
     """Nor is another output of the same command written then."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("a2tg_jax.results.model_source.open_source", lambda *_: None)
     with_record(tmp_path / "run", RunRecord(SceneSource("synthetic")))
     a2tg.save_model("model.npz", a_model())
     a2tg.save_ply("scene.ply", a_model())

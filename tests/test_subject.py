@@ -6,6 +6,9 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from PIL import Image
+from run_folders import create_run
+from scipy.ndimage import binary_closing, binary_dilation, binary_erosion
 from scipy.spatial.transform import Rotation
 from small_files import model_in, taken_apart
 from small_values import some_world
@@ -14,8 +17,10 @@ import a2tg_jax as a2tg
 from a2tg_jax import Gaussians, Model, Origin
 from a2tg_jax.cli.main import main
 from a2tg_jax.io.columns import decode
+from a2tg_jax.io.edit_file import Edit, save_edit
 from a2tg_jax.io.subject import find_subject
 from a2tg_jax.io.web_scene import encode_web_scene
+from a2tg_jax.results.record import RunRecord, SceneSource, write_record
 
 K = jnp.asarray([[80.0, 0, 40], [0, 80.0, 30], [0, 0, 1]])
 UP = np.array([0.0, 0.0, 1.0])
@@ -237,3 +242,108 @@ def test_pages_have_the_same_subject():
     assert header["page"]["subject"] == subject.words
     assert "subject" not in taken_apart(encode_web_scene(model, finds_subject=False))[0]["page"]
     assert model_in(data).num == model.num
+
+
+SIZE = (160, 120)
+"""Width and height of the photographs."""
+
+
+def write_photographs(folder, cameras, distortion):
+    """A scene folder with photographs of noise, through a lens with radial distortion."""
+    (folder / "images" / "day").mkdir(parents=True)
+    frames = []
+    for index, camera in enumerate(cameras):
+        name = f"images/day/{index:02}.jpg"
+        noise = np.random.default_rng(index).integers(0, 256, (*SIZE[::-1], 3), np.uint8)
+        Image.fromarray(noise).save(folder / name)
+        pose = np.linalg.inv(np.asarray(camera.viewmat, np.float64)) @ np.diag([1.0, -1, -1, 1])
+        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
+    header = "ply\nformat ascii 1.0\nelement vertex 2\n" + "".join(f"property float {axis}\n" for axis in "xyz")
+    (folder / "points.ply").write_text(f"{header}end_header\n0 0 0.2\n0 0 0.3\n")
+    lens = {"fl_x": 160, "fl_y": 160, "cx": 80, "cy": 60, "w": 160, "h": 120, "k1": distortion}
+    scene = {"camera_model": "OPENCV", "ply_file_path": "points.ply", **lens, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(scene))
+
+
+def outline(points, camera):
+    """The pixels [H, W] that points near each other cover, with an edge around them, and those within that edge."""
+    width, height = camera.width, camera.height
+    seen = points @ np.asarray(camera.viewmat, np.float64)[:3, :3].T + np.asarray(camera.viewmat)[:3, 3]
+    x, y, _ = np.asarray(camera.K, np.float64) @ (seen / seen[:, 2:]).T
+    is_inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    covered = np.zeros((height, width), bool)
+    covered[y[is_inside].astype(int), x[is_inside].astype(int)] = True
+    whole = binary_closing(np.pad(covered, 8), iterations=4)[8:-8, 8:-8]
+    return binary_dilation(whole, iterations=2), binary_erosion(whole, iterations=2)
+
+
+def write_run(folder, source, model):
+    """A run whose training on a scene ended with a model."""
+    run = create_run(folder)
+    record = RunRecord(source, "gaussians-2d", a2tg.Gaussians2d())
+    write_record(run, record)
+    file = run.model(record.plan.main[-1])
+    file.parent.mkdir()
+    a2tg.save_model(file, model)
+    return run
+
+
+@pytest.mark.parametrize("distortion", [0.0, -0.3])
+def test_training_reads_the_masks_of_the_subject(tmp_path, capsys, distortion):
+    """Their places are checked in the undistorted, smaller views that a training has. A plate between one camera and
+    the subject hides half of it."""
+    if distortion:
+        pytest.importorskip("pycolmap")
+    splats = Splats(0)
+    splats.add_object(np.zeros(3))
+    splats.add_floor()
+    splats.add_room()
+    cameras = around([0, 0, 0.25])
+    eye = np.asarray(cameras[3].center, np.float64)
+    towards = np.array([0, 0, 0.25]) - eye
+    towards /= np.linalg.norm(towards)
+    across = np.cross(towards, UP)
+    places = splats.rng.uniform([0, -0.06], [0.1, 0.06], (900, 2)) @ np.stack([across, np.cross(across, towards)])
+    splats.add(eye + 0.25 * towards + places, np.tile(towards, (900, 1)), size=0.003, opacity=0.95, is_subject=False)
+    write_photographs(tmp_path / "scene", cameras, distortion)
+    source = SceneSource(str(tmp_path / "scene"), downscale=2)
+    scene = source.load()
+    model = dataclasses.replace(splats.model(cameras).transform(scene.transform), origin=scene.origin)
+    run = write_run(tmp_path / "run", source, model)
+    masks = tmp_path / "scene" / "masks"
+    words = ["mask", str(run.path), "--out", str(masks)]
+    assert main(words) == 0
+    printed = capsys.readouterr().out
+    assert f"wrote 24 masks to {masks}/: the subject ({find_subject(model).words}) covers " in printed
+    assert f"a2tg train --config {run.record} --mask-as background" in printed
+    with Image.open(masks / "day" / "03.jpg.png") as mask:
+        assert mask.size == SIZE
+    points = np.asarray(model.gaussians.means, np.float64)
+    cut_out = dataclasses.replace(source, mask_as="background").load()
+    for view in (*cut_out.train, *cut_out.test):
+        is_white = view.picture.read()[..., 3] > 127
+        around_it, within = outline(points[splats.is_subject], view.camera)
+        # Edges of splats.
+        assert np.sum(is_white & ~around_it) <= 3
+        if view.name == "images/day/03.jpg":
+            around_plate, within_plate = outline(points[-900:], view.camera)
+            assert np.sum(within & within_plate) > 100 and not is_white[within_plate].any()
+            within &= ~around_plate
+        # Corners of the outline are filled, and what touches the floor may go with it.
+        assert np.sum(within) > 100 and is_white[within].mean() > 0.95
+    assert main(words) == 2 and "exists; add --overwrite to replace it" in capsys.readouterr().err
+    # This edit keeps everything.
+    save_edit(tmp_path / "edit.json", Edit(background=(1.0, 1.0, 1.0)))
+    assert main([*words, "--overwrite", "--edit", str(tmp_path / "edit.json")]) == 0
+    assert "what the edit keeps covers 100 % of the photographs" in capsys.readouterr().out
+
+
+def test_masks_need_a_subject_and_a_scene_that_reads_them(tmp_path, capsys):
+    splats = Splats(0)
+    splats.add_floor()
+    model = looking(splats.model([]), [])
+    for scene, message in {"synthetic": "is a built-in scene", "/scenes/a": "no subject: it follows from"}.items():
+        run = write_run(tmp_path / scene[-1], SceneSource(scene), model)
+        assert main(["mask", str(run.path), "--out", str(tmp_path / "masks")]) == 2
+        assert message in capsys.readouterr().err
+    assert not (tmp_path / "masks").exists()

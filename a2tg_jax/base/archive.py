@@ -69,7 +69,10 @@ def read_archive(
         reason = str(error).removeprefix(f"{path}: ")
         raise ValueError(f"{path}: is not an {format}, or is damaged ({reason}); copy or write it again") from error
     if header.get("format") != format:
-        raise ValueError(f"{path}: is an {shortened(header.get('format'))}, not an {format}")
+        # Naming a checkpoint instead of its run folder is another one.
+        run = path.parent.parent
+        advice = f"; give its run folder, {run}" if (run / "run.toml").is_file() else ""
+        raise ValueError(f"{path}: is an {shortened(header.get('format'))}, not an {format}{advice}")
     if header.get("version") != VERSION:
         raise ValueError(
             f"{path}: is an {format} of version {shortened(header.get('version'))}; this program reads version "

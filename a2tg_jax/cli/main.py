@@ -40,6 +40,7 @@ Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textu
   a2tg compare runs/scene runs/b       write a page that shows two runs with a divider
   a2tg convert runs/scene scene.sog    convert splats to and from PLY, SPZ, SOG, glTF and others
   a2tg edit runs/scene --out x.npz     crop, turn upright, remove floaters, without a browser
+  a2tg mask runs/scene --out masks     masks of the photographs, to train the subject alone
   a2tg compress runs/scene             write a small file of the trained model
   a2tg info runs/scene                 print what a run folder, or a file of splats, holds
   a2tg doctor                          print what this machine computes with, and test it
@@ -85,9 +86,9 @@ Examples:
 COMMANDS = {
     "demo": "first_steps:Demo", "make": "make:Make", "train": "train:Train", "eval": "runs:Eval",
     "finish": "runs:Finish", "render": "runs:Render", "mesh": "runs:MeshCommand", "view": "runs:ViewCommand",
-    "export": "runs:Export", "convert": "runs:Convert", "edit": "runs:EditCommand", "compare": "runs:Compare",
-    "compress": "runs:Compress", "info": "runs:Info", "sfm": "inputs:Sfm", "download": "inputs:Download",
-    "doctor": "first_steps:Doctor",
+    "export": "runs:Export", "convert": "runs:Convert", "edit": "runs:EditCommand", "mask": "runs:MaskCommand",
+    "compare": "runs:Compare", "compress": "runs:Compress", "info": "runs:Info", "sfm": "inputs:Sfm",
+    "download": "inputs:Download", "doctor": "first_steps:Doctor",
 }  # fmt: skip
 """Module of `a2tg_jax.cli` and dataclass of each command."""
 WITHOUT_JAX = frozenset({"sfm", "download"})

@@ -1,5 +1,5 @@
 """The commands for finished runs and models: `a2tg eval`, `finish`, `render`, `mesh`, `view`, `export`, `convert`,
-`compress` and `info`.
+`edit`, `mask`, `compress` and `info`.
 
 Each imports what it works with when it runs: JAX takes a second, which a mistyped option should not cost.
 """
@@ -228,10 +228,10 @@ class MeshCommand:
         check_options(self.options, out)
         files = mesh_files(out, has_texture=self.options.texture != "none")
         check_not_source(files, self.source, "--out")
-        source = open_source(self.source, self.model, self.edit)
         check_output(out)
         for file in files:
             check_export(file, default, "--out", overwrite=self.overwrite)
+        source = open_source(self.source, self.model, self.edit)
         if is_run and out.resolve() == default.resolve():
             # Listed, so that the next a2tg mesh may replace it (check_export).
             RunFolder(self.source).own(default)
@@ -406,6 +406,34 @@ class EditCommand:
         from a2tg_jax.results.editing import write_edit
 
         print(write_edit(self.source, self.out, self.options, self.model, overwrite=self.overwrite))
+
+
+@dataclasses.dataclass(frozen=True)
+class MaskCommand:
+    """Write masks of the photographs from a first, short training, to train the subject alone.
+
+    A mask is white where at least half of the light comes from the subject. Training reads masks from the folder masks
+    next to images; with --mask-as background, black pixels become empty.
+
+    Examples:
+      a2tg mask runs/toy --out scenes/toy/masks
+      a2tg mask runs/toy --out scenes/toy/masks --edit edit.json
+    """
+
+    folder: RunFolderPath
+    out: Path
+    """Output folder."""
+    edit: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Edit (*.json), as a2tg view saves it; the masks show what it keeps, such as a crop box, instead of the
+    subject."""
+    model: LastModel = None
+    overwrite: bool = False
+    """Replace masks that exist."""
+
+    def run(self) -> None:
+        from a2tg_jax.results.masking import write_masks
+
+        print(write_masks(open_run(self.folder), self.out, self.edit, self.model, overwrite=self.overwrite))
 
 
 @dataclasses.dataclass(frozen=True)

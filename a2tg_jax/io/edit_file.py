@@ -181,21 +181,28 @@ def apply_edit(model: Model, edit: Edit) -> Model:
 def apply_with_subject(model: Model, edit: Edit, subject: Subject | None) -> Model:
     """Return an edited model as `apply_edit`, given its subject; None: the edit keeps more than that."""
     model = model.live
+    is_kept = kept_by(model, edit, subject)
+    model = model if is_kept.all() else model[is_kept]
+    if edit.up is not None:
+        origin = model.origin or Origin.of_cameras([])
+        model = dataclasses.replace(model, origin=dataclasses.replace(origin, up=edit.up))
+    return model if edit.background is None else dataclasses.replace(model, background=edit.background)
+
+
+def kept_by(model: Model, edit: Edit, subject: Subject | None) -> np.ndarray:
+    """Return [N] bool, True for the live Gaussians that an edit keeps, given the subject; None: it keeps more than
+    that. Raises ValueError if no Gaussian would be left."""
     is_kept = np.ones(model.num, bool)
     if edit.floaters > 0:
         is_kept &= scores_of(model) <= largest_score(edit.floaters)
     if subject is not None:
         is_kept &= subject.is_kept
     if edit.crop is not None:
-        places = np.asarray(model.gaussians.means, np.float64) @ edit.crop.axes.T
+        places = np.asarray(model.live.gaussians.means, np.float64) @ edit.crop.axes.T
         is_kept &= ((places >= edit.crop.low) & (places <= edit.crop.high)).all(axis=1)
     if model.num and not is_kept.any():
         raise ValueError(f"the edit would remove all {model.num:,} Gaussians: widen its crop, or lower its floaters")
-    model = model if is_kept.all() else model[is_kept]
-    if edit.up is not None:
-        origin = model.origin or Origin.of_cameras([])
-        model = dataclasses.replace(model, origin=dataclasses.replace(origin, up=edit.up))
-    return model if edit.background is None else dataclasses.replace(model, background=edit.background)
+    return is_kept
 
 
 def largest_score(strictness: float) -> int:

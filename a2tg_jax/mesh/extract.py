@@ -177,10 +177,11 @@ def extract_mesh(
             f"a voxel is {voxel / radius:.2g} of the radius, which is too large to show a surface: raise `resolution`, "
             f"lower `voxel` to {LARGEST_VOXEL:g} of the radius at most, or raise `radius`"
         )
-    # A level takes at most a third of the bytes that the one before takes.
     sides = _voxels_of_levels(voxel, radius) if fill_holes else [voxel]
     spaces = [Space.of(center, radius, side, unbounded) for side in sides]
-    grids = [BlockGrid(int(2 / 3 * max_bytes / 3**level)) for level in range(len(sides))]
+    # A level takes at most a third of the bytes that the one before takes.
+    shares = 1 / 3.0 ** np.arange(len(sides))
+    grids = [BlockGrid(int(share * max_bytes)) for share in shares / shares.sum()]
     seen: list[np.ndarray] = []
     try:
         for camera in progress_over(cameras, "fusing", "view", is_shown=progress):

@@ -224,9 +224,17 @@ def open_run(path: Path) -> RunFolder:
     """Return an existing run folder. Raises FileNotFoundError if there is none at `path`."""
     run = RunFolder(path)
     if not is_regular(run.record):
-        hint = model_hint(path) or "; a2tg train --out makes one"
+        hint = run_hint(path) or model_hint(path) or "; a2tg train --out makes one"
         raise FileNotFoundError(f"{path} is not a run folder (it has no run.toml){hint}")
     return run
+
+
+def run_hint(path: Path) -> str:
+    """Return the hint at the run folder that a folder or file is in, to append to an error; "" if it is in none."""
+    for folder in path.parents[:2]:
+        if is_regular(RunFolder(folder).record):
+            return f": it is in the run folder {folder}; give that folder"
+    return ""
 
 
 def runs_in(folder: Path) -> list[RunFolder]:

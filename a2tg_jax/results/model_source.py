@@ -30,7 +30,7 @@ from a2tg_jax.io.formats import FORMATS, format_of, load_splats, splats_at
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.model import plain_gaussians
 from a2tg_jax.results.commands import first_training_command, resuming_command
-from a2tg_jax.results.folder import RunFolder, iteration_of, open_run, runs_in
+from a2tg_jax.results.folder import RunFolder, iteration_of, open_run, run_hint, runs_in
 from a2tg_jax.results.history import write_history
 from a2tg_jax.results.plan import PlannedStage, RunPlan
 from a2tg_jax.results.record import RunRecord, read_record
@@ -219,7 +219,7 @@ def _run_at(folder: Path) -> RunFolder:
     if runs:
         names = first_names([shlex.quote(str(run.path)) for run in runs])
         raise FileNotFoundError(f"{folder} holds run folders; give one of them: {names}")
-    hint = model_hint(folder) or f"; give {SHOWN}"
+    hint = run_hint(folder) or model_hint(folder) or f"; give {SHOWN}"
     raise FileNotFoundError(f"{folder} is not a run folder (it has no run.toml){hint}")
 
 
