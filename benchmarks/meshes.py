@@ -3,8 +3,9 @@
     python -m benchmarks.meshes --resolution 1024
     python -m benchmarks.meshes --texture
 
-Seconds are those of the processor, over all cores; the first view, which compiles, is left out of the medians. Textures
-need `pip install 'a2tg-jax[mesh]'`.
+Seconds are those of the processor, over all cores; the first view, which compiles, is left out of the medians. What
+larger voxels take, which fill holes, `a2tg mesh --no-fill-holes` does not. Textures need
+`pip install 'a2tg-jax[mesh]'`.
 """
 
 import argparse
@@ -20,8 +21,15 @@ import a2tg_jax as a2tg
 from a2tg_jax.core.cameras import resize_camera
 from a2tg_jax.core.similarity import transform_gaussians
 from a2tg_jax.data.synthetic import exact_points, still_life
-from a2tg_jax.mesh.extract import GRID_BYTES, common_sphere, surface_of
-from a2tg_jax.mesh.fusion import BlockGrid, Space, fuse, rendered_depth
+from a2tg_jax.mesh.extract import (
+    GRID_BYTES,
+    LEAST_TO_FILL,
+    LEAST_WEIGHT,
+    common_sphere,
+    surface_of,
+    voxels_of_levels,
+)
+from a2tg_jax.mesh.fusion import BlockGrid, Space, fill, fuse, rendered_depth
 from a2tg_jax.renderer import Renderer
 from benchmarks.timing import memory_peak
 
@@ -87,21 +95,32 @@ def measure(model: a2tg.Model, resolution: int, has_texture: bool):
     assert model.origin is not None
     cameras = model.origin.cameras
     center, radius = common_sphere(model.origin.viewmats)
-    space = Space.of(center, radius, radius / resolution, False)
-    grid = BlockGrid(GRID_BYTES)
+    spaces = [Space.of(center, radius, side, False) for side in voxels_of_levels(radius / resolution, radius)]
+    grids = [BlockGrid(GRID_BYTES) for _ in spaces]
     renderer = Renderer(model, cameras=cameras)
     depths_of = jax.jit(rendered_depth)
     times = []
     for camera in cameras:
         rendered, depths = seconds(lambda camera=camera: jax.block_until_ready(depths_of(renderer(camera), camera)))
-        fused, _ = seconds(lambda depths=depths: fuse(grid, depths, space))
-        times.append((rendered, fused))
-    for name, column in zip(("render with depths", "fusing"), np.median(times[1:] or times, axis=0), strict=True):
+        fused = []
+        for grid, space in zip(grids, spaces, strict=True):
+            taken, _ = seconds(lambda grid=grid, space=space, depths=depths: fuse(grid, depths, space))
+            fused.append(taken)
+        times.append((rendered, fused[0], sum(fused[1:])))
+    names = ("render with depths", "fusing", "fusing into larger voxels")
+    for name, column in zip(names, np.median(times[1:] or times, axis=0), strict=True):
         yield f"{name}, each view", f"{column:.2f} s"
-    cubes, mesh = seconds(lambda: surface_of(grid, space))
+    yield "voxels", f"{grids[0].num_bytes / 1e6:.0f} MB"
+    filling = 0.0
+    for level in reversed(range(len(grids) - 1)):
+        least = LEAST_TO_FILL if level else LEAST_WEIGHT
+        taken, _ = seconds(lambda at=level, least=least: fill(grids[at], grids[at + 1], least, LEAST_TO_FILL))
+        filling += taken
+    yield "filling", f"{filling:.2f} s"
+    yield "voxels with larger ones, filled", f"{sum(grid.num_bytes for grid in grids) / 1e6:.0f} MB"
+    cubes, mesh = seconds(lambda: surface_of(grids[0], spaces[0], LEAST_WEIGHT))
     yield "marching cubes", f"{cubes:.2f} s"
     yield "triangles", f"{mesh.num_faces:,}"
-    yield "voxels", f"{grid.num_bytes / 1e6:.0f} MB"
     yield "peak memory", f"{memory_peak() / 1e9:.2f} GB"
     if not has_texture:
         return

@@ -177,7 +177,7 @@ def extract_mesh(
             f"a voxel is {voxel / radius:.2g} of the radius, which is too large to show a surface: raise `resolution`, "
             f"lower `voxel` to {LARGEST_VOXEL:g} of the radius at most, or raise `radius`"
         )
-    sides = _voxels_of_levels(voxel, radius) if fill_holes else [voxel]
+    sides = voxels_of_levels(voxel, radius) if fill_holes else [voxel]
     spaces = [Space.of(center, radius, side, unbounded) for side in sides]
     # A level takes at most a third of the bytes that the one before takes.
     shares = 1 / 3.0 ** np.arange(len(sides))
@@ -217,7 +217,7 @@ def extract_mesh(
     return MeshResult(mesh, center, radius, voxel, len(cameras), num_dropped, missing, num_bytes, seconds)
 
 
-def _voxels_of_levels(voxel: float, radius: float) -> list[float]:
+def voxels_of_levels(voxel: float, radius: float) -> list[float]:
     """Return the sides of voxels of all levels, the smallest first."""
     sides = [voxel]
     while len(sides) < MOST_LEVELS and 2 * TRUNCATION * sides[-1] <= LONGEST_TRUNCATION * radius:
