@@ -137,7 +137,9 @@ def test_commands_take_an_edit(tmp_path, capsys):
     assert a2tg.load_ply(tmp_path / "n.ply").num == page.num == edited.num
     assert page.origin == edited.origin
     assert main([*words[:2], str(tmp_path / "o.npz"), "--edit", str(tmp_path / "none.json")]) == 2
-    assert "no such edit; the viewer's 'Save edit' makes one" in capsys.readouterr().err
+    assert "no such edit; a2tg edit or the viewer's 'Save edit' makes one" in capsys.readouterr().err
+    assert main([*words[:2], str(tmp_path / "o.npz"), "--edit", str(tmp_path / "n.ply")]) == 2
+    assert "; give edit.json, which a2tg edit or the viewer's 'Save edit' makes\n" in capsys.readouterr().err
 
 
 def test_an_edit_from_flags(tmp_path, capsys):

@@ -227,6 +227,43 @@ def test_info_of_a_folder_lists_its_runs(tmp_path, capsys):
     assert "is not valid TOML" in facts[0]["damage"] and facts[1]["damage"] is None
 
 
+def test_info_of_a_folder_has_the_progress_of_begun_runs_and_those_of_make(tmp_path, capsys):
+    runs = {}
+    for name in ("first", "miku/run", "next"):
+        runs[name] = with_record(tmp_path / name, RunRecord(SceneSource("synthetic"), "a2tg", A2tg()))
+        runs[name].model(NAMES[0]).parent.mkdir()
+        runs[name].checkpoint(NAMES[0], 201).parent.mkdir()
+    runs["first"].checkpoint(NAMES[0], 201).touch()
+    for name in ("miku/run", "next"):
+        a2tg.save_model(runs[name].model(NAMES[0]), a_model())
+    runs["next"].checkpoint(NAMES[1], 7).touch()
+    assert cli.main(["info", str(tmp_path)]) == 0
+    rows = [re.split(r"  +", line) for line in capsys.readouterr().out.splitlines()]
+    assert [(name, system) for name, system, *_ in rows] == [(str(Path(name)), "a2tg") for name in runs]
+    first, made, later = (row[-1] for row in rows)
+    assert first.startswith(f"{NAMES[0]} after iteration 201 of ")
+    assert made == f"{NAMES[0]} 3 Gaussians; 696 bytes"
+    assert later.startswith(f"{NAMES[1]} after iteration 7 of ")
+
+
+def test_a_folder_of_runs_is_answered_with_the_runs_to_give(tmp_path, capsys):
+    made = with_record(tmp_path / "miku" / "run").path
+    page = ["--web", str(tmp_path / "page")]
+    for folder in (tmp_path, made.parent):
+        for words in (
+            ["render", folder],
+            ["eval", folder],
+            ["export", folder, *page],
+            ["train", "--resume", "--out", folder],
+        ):
+            assert cli.main(list(map(str, words))) == 2
+            wanted = (
+                f"{folder} is not a run folder (it has no run.toml): it holds run folders; give one of them: {made}\n"
+            )
+            assert wanted in capsys.readouterr().err
+        assert not (folder / ".a2tg-run").exists()
+
+
 def test_info_is_json_on_request(tmp_path, capsys):
     run = with_record(tmp_path / "run", RunRecord(SceneSource("synthetic"), "a2tg", A2tg()))
     run.metrics.write_text(json.dumps({"models": {"a2tg-gaussians": {"test": {"psnr": 20.5}}}}))

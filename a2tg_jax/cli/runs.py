@@ -497,7 +497,11 @@ class Info:
             return
         runs = [] if RunFolder(self.folder).record.is_file() else runs_in(self.folder)
         if runs:
-            print(json_text([info.facts_or_damage(run) for run in runs]) if self.json else info.describe_runs(runs))
+            print(
+                json_text([info.facts_or_damage(run) for run in runs])
+                if self.json
+                else info.describe_runs(runs, self.folder)
+            )
             return
         run = open_run(self.folder)
         print(json_text(info.run_facts(run)) if self.json else info.describe_run(run))

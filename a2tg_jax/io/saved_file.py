@@ -9,6 +9,8 @@ from a2tg_jax.base.regular_files import check_exists, expanded
 
 T = TypeVar("T")
 VERSION = 1
+WRITERS = {"path": "the viewer's 'Save path'", "edit": "a2tg edit or the viewer's 'Save edit'"}
+"""What makes a file of each kind."""
 
 
 def load_saved(path: Path, kind: str, parse: Callable[[dict[str, Any]], T]) -> T:
@@ -19,12 +21,16 @@ def load_saved(path: Path, kind: str, parse: Callable[[dict[str, Any]], T]) -> T
       ValueError: naming the file, if it is of another kind or version, or `parse` raises ValueError.
     """
     path = expanded(path)
-    check_exists(path, f"{kind}; the viewer's 'Save {kind}' makes one")
-    data = read_json(path, allow_nan=False)
+    check_exists(path, f"{kind}; {WRITERS[kind]} makes one")
+    wanted = f"give {kind}.json, which {WRITERS[kind]} makes"
+    try:
+        data = read_json(path, allow_nan=False)
+    except ValueError as error:
+        raise ValueError(f"{error}; {wanted}") from None
     try:
         if not isinstance(data, dict) or (data.get("format"), data.get("version")) != (f"a2tg-jax {kind}", VERSION):
             article = "an" if kind[0] in "aeiou" else "a"
-            raise ValueError(f"is not {article} {kind} of version {VERSION} that the viewer saved")
+            raise ValueError(f"is not {article} {kind} of version {VERSION}; {wanted}")
         return parse(data)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error

@@ -26,6 +26,7 @@ import contextlib
 import glob
 import json
 import os
+import shlex
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -33,6 +34,7 @@ from pathlib import Path
 from a2tg_jax.base.atomic import left_over, named_if_full, write_whole
 from a2tg_jax.base.operating_system import flush_folder, try_lock
 from a2tg_jax.base.regular_files import is_regular, read_regular
+from a2tg_jax.base.text import first_names
 from a2tg_jax.data.other_runs import model_hint
 
 # If the newest is damaged, training continues from the one before.
@@ -45,6 +47,8 @@ MOST_MARKER_BYTES = 1 << 24
 DAMAGED = ".damaged"
 """Suffix added to the name of a damaged checkpoint."""
 OLD = ".a2tg-old"
+MADE = "run"
+"""Name of the run folder in an output folder of a2tg make."""
 IN_USE = "is not empty; add `resume` to continue it, `overwrite` to start again, or choose another `out`"
 """Error text of training for a folder that already holds a run."""
 
@@ -220,27 +224,40 @@ def iteration_of(checkpoint: Path) -> int:
     return int(checkpoint.stem.rpartition("-")[2])
 
 
-def open_run(path: Path) -> RunFolder:
-    """Return an existing run folder. Raises FileNotFoundError if there is none at `path`."""
+def open_run(path: Path, otherwise: str = "a2tg train --out makes one") -> RunFolder:
+    """Return an existing run folder.
+
+    Args:
+      path: the folder.
+      otherwise: advice if no run and no model of another program is near.
+
+    Raises:
+      FileNotFoundError: if there is none at `path`, naming runs in and above it.
+    """
     run = RunFolder(path)
     if not is_regular(run.record):
-        hint = run_hint(path) or model_hint(path) or "; a2tg train --out makes one"
+        hint = _run_hint(path) or model_hint(path) or f"; {otherwise}"
         raise FileNotFoundError(f"{path} is not a run folder (it has no run.toml){hint}")
     return run
 
 
-def run_hint(path: Path) -> str:
-    """Return the hint at the run folder that a folder or file is in, to append to an error; "" if it is in none."""
+def _run_hint(path: Path) -> str:
+    """Return the hint at the run folder that a folder or file is in, or at the runs in it, to append to an error; ""
+    without any."""
     for folder in path.parents[:2]:
         if is_regular(RunFolder(folder).record):
             return f": it is in the run folder {folder}; give that folder"
-    return ""
+    runs = [shlex.quote(str(run.path)) for run in runs_in(path)]
+    return f": it holds run folders; give one of them: {first_names(runs)}" if runs else ""
 
 
 def runs_in(folder: Path) -> list[RunFolder]:
-    """Return the runs whose folders are in a folder, sorted by name."""
+    """Return the runs whose folders are in a folder, or in output folders of a2tg make there, sorted by name."""
     entries = sorted(folder.iterdir()) if folder.is_dir() else []
-    return [run for run in map(RunFolder, entries) if run.record.is_file()]
+    runs = []
+    for entry in entries:
+        runs += [run for run in (RunFolder(entry), RunFolder(entry / MADE)) if run.record.is_file()]
+    return runs
 
 
 def check_free(path: Path, *, overwrite: bool = False, in_use: str = IN_USE) -> None:

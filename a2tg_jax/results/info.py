@@ -80,16 +80,23 @@ def describe_file(path: Path) -> str:
     ])  # fmt: skip
 
 
-def describe_runs(runs: Sequence[RunFolder]) -> str:
-    """Return a line for each run: its name, system, last model and disk use, or what is damaged."""
+def describe_runs(runs: Sequence[RunFolder], folder: Path) -> str:
+    """Return a line for each run in a folder: its name, system, disk use, and the last model or the progress of its
+    main system, or what is damaged."""
     rows = []
     for run in runs:
+        name = str(run.path.relative_to(folder))
         facts = facts_or_damage(run)
         if "system" not in facts:
-            rows.append((run.path.name, "", "", facts["damage"]))
+            rows.append((name, "", "", facts["damage"]))
             continue
-        last = facts["stages"][len(read_record(run).plan.main) - 1]
-        rows.append((run.path.name, facts["system"], in_bytes(facts["disk_bytes"]), _stage_text(last)))
+        main = facts["stages"][: len(read_record(run).plan.main)]
+        begun = [stage for stage in main if stage["state"] != "not begun"]
+        last = begun[-1] if begun else main[-1]
+        text = _stage_text(last)
+        if last["state"] == "in training" or last is not main[-1]:
+            text = f"{last['name']} {text}"
+        rows.append((name, facts["system"], in_bytes(facts["disk_bytes"]), text))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return "\n".join("  ".join(map(str.ljust, row, widths)).rstrip() for row in rows)
 

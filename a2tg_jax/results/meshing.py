@@ -18,7 +18,7 @@ from a2tg_jax.results.model_source import Source
 from a2tg_jax.results.options import MeshOptions
 
 MUCH_MISSING = 0.05
-MANY_HOLES = ": train gaussians-2d with `preset` surfaces, or from more photographs, or give a smaller `resolution`"
+MANY_HOLES = ": train gaussians-2d with --preset surfaces, or from more photographs, or give a smaller --resolution"
 """Advice for meshes of which more than `MUCH_MISSING` is missing."""
 GRID_SHARE = 0.5
 """Default share of the free memory for voxels."""

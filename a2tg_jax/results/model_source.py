@@ -3,7 +3,6 @@ file as the first stage of a run."""
 
 import dataclasses
 import functools
-import shlex
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -22,7 +21,6 @@ from a2tg_jax import (
     transform_gaussians,
 )
 from a2tg_jax.base.regular_files import is_regular
-from a2tg_jax.base.text import first_names
 from a2tg_jax.data.load import is_scene
 from a2tg_jax.data.other_runs import model_hint
 from a2tg_jax.io.edit_file import apply_edit, load_edit
@@ -30,7 +28,7 @@ from a2tg_jax.io.formats import FORMATS, format_of, load_splats, splats_at
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.model import plain_gaussians
 from a2tg_jax.results.commands import first_training_command, resuming_command
-from a2tg_jax.results.folder import RunFolder, iteration_of, open_run, run_hint, runs_in
+from a2tg_jax.results.folder import RunFolder, iteration_of, open_run
 from a2tg_jax.results.history import write_history
 from a2tg_jax.results.plan import PlannedStage, RunPlan
 from a2tg_jax.results.record import RunRecord, read_record
@@ -210,17 +208,10 @@ def settings_of(system: System) -> RenderSettings:
 
 def _run_at(folder: Path) -> RunFolder:
     """Return the run folder, or raise FileNotFoundError with what the folder is instead."""
-    if is_regular(RunFolder(folder).record):
-        return open_run(folder)
     # A scene folder is a likely mistake.
-    if is_scene(folder):
+    if not is_regular(RunFolder(folder).record) and is_scene(folder):
         raise FileNotFoundError(f"{folder} is a scene that must be trained first: {first_training_command(folder)}")
-    runs = runs_in(folder)
-    if runs:
-        names = first_names([shlex.quote(str(run.path)) for run in runs])
-        raise FileNotFoundError(f"{folder} holds run folders; give one of them: {names}")
-    hint = run_hint(folder) or model_hint(folder) or f"; give {SHOWN}"
-    raise FileNotFoundError(f"{folder} is not a run folder (it has no run.toml){hint}")
+    return open_run(folder, f"give {SHOWN}")
 
 
 # Splats of a file instead of the first stage of a run

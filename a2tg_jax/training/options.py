@@ -283,7 +283,7 @@ class System(NamedFields):
         if name not in presets:
             raise ValueError(
                 f"{cls.name or cls.__name__} has the presets {', '.join(presets)}; got {shortened(name)!r}"
-                f"{did_you_mean(name, presets)}; the class method `presets` defines others"
+                f"{did_you_mean(name, presets)}"
             )
         return changed_config(presets[name], options, cls.__name__) if options else presets[name]
 
