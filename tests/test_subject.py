@@ -20,6 +20,7 @@ from a2tg_jax.io.columns import decode
 from a2tg_jax.io.edit_file import Edit, save_edit
 from a2tg_jax.io.subject import find_subject
 from a2tg_jax.io.web_scene import encode_web_scene
+from a2tg_jax.results.frames import widen_camera, with_whole_subject
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record
 
 K = jnp.asarray([[80.0, 0, 40], [0, 80.0, 30], [0, 0, 1]])
@@ -242,6 +243,34 @@ def test_pages_have_the_same_subject():
     assert header["page"]["subject"] == subject.words
     assert "subject" not in taken_apart(encode_web_scene(model, finds_subject=False))[0]["page"]
     assert model_in(data).num == model.num
+
+
+def test_an_orbit_shows_the_whole_subject_though_photographs_look_at_its_foot():
+    splats = Splats(0)
+    splats.add_object(np.zeros(3))
+    splats.add_floor()
+    model = splats.model(around([0, 0, 0.05]))
+    zoomed = K.at[:2, :2].multiply(1.8)
+    orbit = [dataclasses.replace(camera, K=zoomed) for camera in a2tg.turntable(model.origin.cameras, 5, UP)]
+    orbit = [widen_camera(camera, 160, 90) for camera in orbit]
+
+    def reach(cameras):
+        """Largest distance of the subject from the middle of a frame, over the frame's half width or height."""
+        points = np.asarray(model.gaussians.means)[splats.is_subject]
+        offsets = []
+        for camera in cameras:
+            seen = points @ np.asarray(camera.viewmat)[:3, :3].T + np.asarray(camera.viewmat)[:3, 3]
+            x, y, depth = np.asarray(camera.K) @ seen.T
+            offsets += [np.abs(2 * x / depth / 160 - 1).max(), np.abs(2 * y / depth / 90 - 1).max()]
+        return max(offsets)
+
+    whole = with_whole_subject(orbit, model)
+    assert reach(orbit) > 1.1
+    assert reach(whole) == pytest.approx(0.9, abs=0.02)
+    assert len({tuple(np.ravel(camera.K)) for camera in whole}) == 1
+    upright = [widen_camera(camera, 60, 120) for camera in orbit]
+    for unchanged, model_of in ((upright, model), (orbit, looking(model, []))):
+        np.testing.assert_array_equal(with_whole_subject(unchanged, model_of)[0].K, unchanged[0].K)
 
 
 SIZE = (160, 120)

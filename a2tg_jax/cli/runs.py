@@ -143,10 +143,10 @@ class Render:
     size: Annotated[
         str | None,
         arg(metavar="WxH"),
-        defaulting_to("1280x720, or 720x1280 if the photographs are upright"),
+        defaulting_to("as many pixels as 1280x720, in the photographs' aspect"),
     ] = None
-    """Width and height of the frames in pixels, such as 1920x1080; test views keep theirs by default. Views of another
-    aspect are cropped, but orbit and front show them whole, with more at two sides."""
+    """Width and height of the frames in pixels, such as 1920x1080; test views keep theirs by default. In another aspect
+    views are whole, with more at two sides. An orbit shows the whole subject in any."""
     supersample: int = 1
     """Factor k by which frames are drawn larger and averaged: without aliasing where frames are smaller than the
     photographs, at k² times the cost."""

@@ -5,6 +5,7 @@ The folder has a list of rendered files. No other file is replaced without `over
 
 import contextlib
 import dataclasses
+import math
 import os
 import re
 import shutil
@@ -26,14 +27,17 @@ from a2tg_jax.data.camera_paths import front_view
 from a2tg_jax.data.capture_geometry import SURROUNDED, largest_gap, matrices_of, without_outlying
 from a2tg_jax.host.progress_bars import progress_over
 from a2tg_jax.io.path_file import load_views
+from a2tg_jax.io.subject import find_subject
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.images import picture_names, save_animation, to_uint8, write_png
 from a2tg_jax.results.model_source import open_source
 from a2tg_jax.results.options import FRAMES_PER_SECOND, STILLS, CameraPath
 from a2tg_jax.results.output_paths import check_new
 
-FLIGHT_SIZE = (1280, 720)
-"""Default width and height of the frames of flights, in pixels."""
+FRAME_PIXELS = 1280 * 720
+"""Default width × height of frames, which have the photographs' aspect."""
+SUBJECT_SHARE = 0.9
+"""Largest share of the width and height of an orbit's frames that the subject takes."""
 LARGEST_SIDE = 8192
 WEBP_QUALITY = 80
 LIST = ".a2tg-frames"
@@ -118,8 +122,8 @@ def render_frames(
         through the views in a file that the viewer saved.
       name: model to render; None: the last one of the run's main system.
       edit: file of an edit that is applied before.
-      size: width and height of the frames; orbit and front show whole views, and other views are cropped to their
-        aspect; None: the cameras' sizes for test views, otherwise `FLIGHT_SIZE`, or upright if the first camera is.
+      size: width and height of the frames. Views of another aspect are whole, with more of the scene at two sides.
+        None: the cameras' sizes for test views; otherwise `FRAME_PIXELS` in the aspect of the first camera.
 
     Raises:
       ValueError, OSError: if that stage is not finished, the views or the path are missing, or a file is in the way.
@@ -131,12 +135,12 @@ def render_frames(
     source = open_source(run.path, name, edit)
     cameras = _cameras(source.model, route, num_frames)
     if size is None and route != "test":
-        first = next(iter(cameras.values()))
-        size = FLIGHT_SIZE if first.width >= first.height else FLIGHT_SIZE[::-1]
+        size = frame_size(next(iter(cameras.values())))
     if size is not None:
-        # Cropped turntables would cut off the subject, which photographs fill.
-        resized = widen_camera if route in ("orbit", "front") else crop_camera
-        cameras = {file_name: resized(camera, *size) for file_name, camera in cameras.items()}
+        cameras = {file_name: widen_camera(camera, *size) for file_name, camera in cameras.items()}
+    if route == "orbit":
+        shown = with_whole_subject(list(cameras.values()), source.model)
+        cameras = dict(zip(cameras, shown, strict=True))
     folder = FrameFolder(out)
     folder.check(cameras, overwrite=overwrite)
     settings = dataclasses.replace(source.settings, supersample=supersample)
@@ -232,24 +236,46 @@ def unseen_angle(origin: Origin) -> float:
     return largest_gap(matrices_of(without_outlying(list(origin.cameras))), origin.vertical)
 
 
-def crop_camera(camera: Camera, width: int, height: int) -> Camera:
-    """Return the view of a pinhole camera at another image size and aspect: scaled to cover it, and cropped around its
-    centre. Rays of a lens are left out."""
-    return _scaled(camera, width, height, max(width / camera.width, height / camera.height))
+def frame_size(camera: Camera) -> tuple[int, int]:
+    """Return the width and height, both even, of `FRAME_PIXELS` in a camera's aspect."""
+    factor = math.sqrt(FRAME_PIXELS / (camera.width * camera.height))
+    width, height = (2 * max(1, round(factor * side / 2)) for side in (camera.width, camera.height))
+    return min(width, LARGEST_SIDE), min(height, LARGEST_SIDE)
 
 
 def widen_camera(camera: Camera, width: int, height: int) -> Camera:
     """Return the view of a pinhole camera at another image size and aspect: scaled to fit, with more of the scene at
     two sides. Rays of a lens are left out."""
-    return _scaled(camera, width, height, min(width / camera.width, height / camera.height))
-
-
-def _scaled(camera: Camera, width: int, height: int, factor: float) -> Camera:
-    """Return a view scaled by a factor, with its centre in the middle of an image of another size."""
+    factor = min(width / camera.width, height / camera.height)
     camera = dataclasses.replace(camera, rays=None)
-    scaled = resize_camera(camera, round(factor * camera.width), round(factor * camera.height))
+    scaled = resize_camera(camera, max(1, round(factor * camera.width)), max(1, round(factor * camera.height)))
     shift = jnp.asarray([(width - scaled.width) / 2, (height - scaled.height) / 2], camera.K.dtype)
     return Camera(camera.viewmat, scaled.K.at[:2, 2].add(shift), width, height)
+
+
+def with_whole_subject(cameras: Sequence[Camera], model: Model) -> list[Camera]:
+    """Return an orbit's cameras with one focal length, at most theirs, at which each shows the whole subject; unchanged
+    if the model has no subject.
+
+    An orbit looks at the point that most photographs aim at, which need not be the middle of the subject.
+    """
+    try:
+        is_kept = find_subject(model).is_kept
+    except ValueError:
+        return list(cameras)
+    points = np.asarray(model.live.gaussians.means, np.float64)[is_kept]
+    factor = 1.0
+    for camera in cameras:
+        viewmat = np.asarray(camera.viewmat, np.float64)
+        K = np.asarray(camera.K, np.float64)
+        places = points @ viewmat[:3, :3].T + viewmat[:3, 3]
+        places = places[places[:, 2] > 0]
+        offsets = places[:, :2] / places[:, 2:] @ K[:2, :2].T
+        # From the principal point to the border on the side of each offset.
+        sizes = np.array([camera.width, camera.height])
+        room = np.where(offsets < 0, K[:2, 2], sizes - K[:2, 2]) - (1 - SUBJECT_SHARE) / 2 * sizes
+        factor = min(factor, (room / np.maximum(np.abs(offsets), 1e-9)).min(initial=1.0))
+    return [dataclasses.replace(camera, K=camera.K.at[:2, :2].multiply(factor)) for camera in cameras]
 
 
 def _numbered(path: Sequence[Camera]) -> dict[str, Camera]:
