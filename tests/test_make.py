@@ -2,6 +2,8 @@
 
 import json
 import re
+import signal
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from PIL import Image
 
 import a2tg_jax as a2tg
 from a2tg_jax.cli import main as cli, make
+from a2tg_jax.host.signals import Stopped
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.minutes import Speed, TimedTraining, measured_speed, training_within
 from a2tg_jax.results.record import read_record
@@ -86,7 +89,99 @@ def test_a_scene_becomes_a_page_by_printed_commands_and_the_same_command_continu
     # The run exists: nothing is chosen or trained again.
     monkeypatch.setattr("a2tg_jax.results.minutes.choose_training", None)
     assert cli.main(words) == 0
-    assert re.findall(r"^\$ a2tg (\w+)", capsys.readouterr().out, flags=re.MULTILINE) == ["export", "render", "render"]
+    printed = capsys.readouterr().out
+    assert re.findall(r"^\$ a2tg (\w+)", printed, flags=re.MULTILINE) == ["export", "render", "render"]
+    assert f"\n$ cp {tmp_path / 'out/flight/front.png'} {tmp_path / 'out/toy.png'}\n" in printed
+
+    # Another photograph is not in the run.
+    (tmp_path / "toy/images/7.png").touch()
+    assert cli.main(words) == 2 and "1 new (toy/images/7.png)" in capsys.readouterr().err
+
+
+def raising(error):
+    def fail(*_):
+        raise error
+
+    return fail
+
+
+def is_answered(capsys, words, *parts):
+    assert cli.main(["make", *map(str, words), "--no-open"]) == 2
+    error = capsys.readouterr().err
+    for part in parts:
+        assert part in error
+
+
+def test_photographs_that_changed_since_the_scene_was_made_are_noticed(tmp_path, monkeypatch, capsys):
+    steps = []
+
+    def find_cameras(name, words):
+        steps.append(name)
+        if len(steps) == 1:
+            raise ValueError("no cameras are found")
+        write_scene(Path(words[-1]))
+        raise ValueError("enough")
+
+    monkeypatch.setattr(make, "run_step", find_cameras)
+    monkeypatch.chdir(tmp_path)
+    photos = Path("miku")
+    for name in ("0.jpg", "1.jpg", "room/2.JPG", "notes.txt", "@eaDir/0.jpg"):
+        (photos / name).parent.mkdir(parents=True, exist_ok=True)
+        (photos / name).write_bytes(b"1234")
+    words = [photos, "--out", "out"]
+    (photos / "blurred.jpg").touch()
+    is_answered(capsys, words, "no cameras are found")
+    (photos / "blurred.jpg").unlink()  # Without a scene, nothing was made from it.
+    is_answered(capsys, words, "enough")
+    assert steps == ["sfm", "sfm"] and (tmp_path / "out/scene/transforms.json").is_file()
+
+    # Changes that are none: another way to give the same files, and what is no photograph.
+    reached = "the training is chosen"
+    monkeypatch.setattr("a2tg_jax.results.minutes.choose_training", raising(ValueError(reached)))
+    (photos / "notes.txt").write_text("longer")
+    (photos / "@eaDir/1.jpg").touch()
+    is_answered(capsys, words, reached)
+    is_answered(capsys, [tmp_path / "miku", "--out", "out"], reached)
+    is_answered(
+        capsys, [*(photos / name for name in ("0.jpg", "1.jpg")), photos / "room", "--out", "out"], "1 new (room/2.JPG)"
+    )
+
+    for number in range(3, 15):
+        (photos / f"{number}.jpg").touch()
+    is_answered(
+        capsys, words, "changed since out was made from them: 12 new (miku/10.jpg, miku/11.jpg, miku/12.jpg, …);"
+    )
+    is_answered(capsys, words, "; give another --out, or remove out to begin again")
+    for number in range(3, 15):
+        (photos / f"{number}.jpg").unlink()
+    (photos / "0.jpg").unlink()
+    (photos / "1.jpg").write_bytes(b"12345")
+    is_answered(capsys, words, "from them: 1 removed (miku/0.jpg), 1 of another size (miku/1.jpg);")
+    (tmp_path / "stitch").mkdir()
+    (tmp_path / "stitch/0.jpg").touch()
+    is_answered(capsys, [photos, "stitch", "--out", "out"], "1 new (stitch/0.jpg)")
+    is_answered(capsys, [photos, "stich", "--out", "out"], "stich: no such file or folder")
+    is_answered(capsys, [photos, "--out", "other"], "enough")
+
+
+def test_another_video_is_noticed(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("clip.mp4").write_bytes(b"123")
+    write_scene(Path("runs/clip/scene"))
+    Path("runs/clip/.a2tg-photographs.json").write_text(json.dumps(make.photograph_sizes([Path("clip.mp4")])))
+    Path("clip.mp4").write_bytes(b"1234")
+    is_answered(capsys, ["clip.mp4"], "runs/clip was made from them: 1 of another size", f"({tmp_path.name}/clip.mp4)")
+
+
+def test_an_interrupted_make_is_continued_by_the_same_command(tmp_path, monkeypatch, capsys):
+    (tmp_path / "my photos").mkdir()
+
+    stopped = Stopped(signal.SIGINT, "continue with: a2tg train --resume")
+    monkeypatch.setattr(make, "run_step", raising(stopped))
+    words = ["make", str(tmp_path / "my photos"), "--out", str(tmp_path / "out"), "--minutes", "7"]
+    assert cli.main(words) == 130
+    command = f"a2tg make '{tmp_path / 'my photos'}' --out {tmp_path / 'out'} --minutes 7"
+    assert capsys.readouterr().err == f"a2tg: interrupted; repeat the same command to continue: {command}\n"
 
 
 def test_files_of_another_origin_are_not_replaced(tmp_path, capsys):

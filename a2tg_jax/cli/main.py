@@ -5,6 +5,7 @@ import contextlib
 import importlib
 import os
 import re
+import shlex
 import sys
 import warnings
 from collections.abc import Sequence
@@ -93,6 +94,8 @@ COMMANDS = {
 """Module of `a2tg_jax.cli` and dataclass of each command."""
 WITHOUT_JAX = frozenset({"sfm", "download"})
 """Commands that do not start JAX."""
+CONTINUING = frozenset({"make", "download"})
+"""Commands that continue when they are repeated."""
 WITHOUT_PATH = frozenset({"demo", "download", "doctor"})
 """Commands whose first argument is no path."""
 BUILT_IN = frozenset({"synthetic", "cells"})
@@ -136,7 +139,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return exit_code
     except KeyboardInterrupt as interrupt:
         stopped = signals.Stopped.of(interrupt)
-        print(f"a2tg: interrupted{stopped.advice and '; ' + stopped.advice}", file=sys.stderr)
+        advice = stopped.advice
+        if name in CONTINUING:  # Instead of the advice of the step that was interrupted.
+            advice = f"repeat the same command to continue: {shlex.join(['a2tg', *words])}"
+        print(f"a2tg: interrupted{advice and '; ' + advice}", file=sys.stderr)
         return stopped.exit_code
     except BrokenPipeError:
         # Python would otherwise flush the buffer again at exit and fail.

@@ -12,7 +12,7 @@ import warnings
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePath, PurePosixPath
 
 import numpy as np
 
@@ -94,6 +94,15 @@ def holds_photos(folder: Path) -> bool:
     return len(list(itertools.islice(photos, LEAST_PHOTOS))) == LEAST_PHOTOS
 
 
+def listed_photos(folder: Path) -> list[Path]:
+    """Return the files in a folder and below it with suffixes of photographs, sorted, without hidden ones.
+
+    `find_photos` leaves out more, such as copies, which it has to read.
+    """
+    photos = (file for file in _files_below(folder) if file.suffix.lower() in PHOTO_SUFFIXES)
+    return sorted(photo for photo in photos if not _is_hidden(photo.relative_to(folder)))
+
+
 def find_photos(folder: Path, least: int = LEAST_PHOTOS, chosen: Sequence[Path] | None = None) -> list[str]:
     """Return paths of the photographs below a folder, relative to it, sorted.
 
@@ -149,8 +158,7 @@ def _left_out(folder: Path, pictures: Sequence[str]) -> dict[str, set[str]]:
     """Return the pictures that are no photographs by what they are, without kinds of which there are none."""
     left_out = {
         OWN: _written(folder, pictures),
-        # Such as @eaDir, Synology's folder of thumbnails.
-        "in hidden folders": {name for name in pictures if any(part[0] in ".@" for part in name.split("/")[:-1])},
+        "in hidden folders": {name for name in pictures if _is_hidden(PurePosixPath(name))},
         "masks or depth maps": _masks(pictures),
     }
     others = set().union(*left_out.values())
@@ -167,6 +175,11 @@ def _about_left_out(left_out: Mapping[str, set[str]]) -> str:
 def _files_below(folder: Path) -> Iterator[Path]:
     # macOS puts ._0.jpg, which is no picture, next to 0.jpg on disks of other systems.
     return (file for file in folder.rglob("*") if file.name[0] != "." and file.is_file())
+
+
+def _is_hidden(path: PurePath) -> bool:
+    """Return whether a relative path is in a hidden folder, or one such as @eaDir, Synology's folder of thumbnails."""
+    return any(part[0] in ".@" for part in path.parts[:-1])
 
 
 def _skipped(folder: Path, files: list[Path]) -> str:
