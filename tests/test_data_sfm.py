@@ -490,6 +490,24 @@ def test_a_part_of_the_photographs_is_no_success(tmp_path, monkeypatch, capsys):
     assert "To train it all the same: a2tg train" in error
 
 
+@pytest.mark.parametrize(
+    ("side", "given", "faster"),
+    [(320, "quick", ""), (640, "quick", "2"), (700, "quick --downscale 2", ""), (4000, "quick --downscale 7", "14")],
+)
+def test_what_trains_quicker_follows_from_the_size_of_the_photographs(
+    tmp_path, monkeypatch, capsys, side, given, faster
+):
+    (tmp_path / "photos").mkdir()
+    scene = tmp_path / "scene"
+    monkeypatch.setattr(sfm, "run_sfm", lambda *_, **__: sfm.SfmSummary(24, 24, 300, 0.5, side))
+    monkeypatch.setattr("a2tg_jax.results.figures.save_camera_picture", lambda *_: None)
+    assert cli.main(["sfm", str(tmp_path / "photos"), str(scene)]) == 0
+    *_, command, quicker = capsys.readouterr().out.splitlines()
+    assert command.endswith(f"--preset {given}")
+    advice = f"--downscale {faster} trains 2 to 3 times as fast; " if faster else ""
+    assert quicker == f"quicker: {advice}a2tg make {scene} --minutes 10 chooses size and iterations for that time"
+
+
 def test_gaps_are_between_photographs_of_one_folder():
     names = [f"{top}/{index}.jpg" for top in ("panorama/heading000", "panorama/up", "phone") for index in range(3)]
     placed = {name for name in names if not name.endswith("1.jpg")} - {"phone/0.jpg"}

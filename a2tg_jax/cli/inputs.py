@@ -59,7 +59,7 @@ class Sfm:
         from a2tg_jax.data.load import is_scene
         from a2tg_jax.data.photo_folder import CAMERA_PICTURE
         from a2tg_jax.data.sfm import run_sfm
-        from a2tg_jax.results.commands import quick_flags
+        from a2tg_jax.results.commands import quick_flags, quicker_advice
         from a2tg_jax.results.figures import save_camera_picture
 
         sources, out = self._places()
@@ -98,6 +98,7 @@ class Sfm:
                 f"less than you photographed; the warnings say what may help. To train it all the same: {command}"
             )
         print(f"cameras: {out / CAMERA_PICTURE}\nscene: {out}; continue with: {command}")
+        print(f"quicker: {quicker_advice(out, summary.longest_side)}")
 
     def _places(self) -> tuple[list[Path], Path]:
         """Return the sources and the scene folder."""

@@ -16,6 +16,8 @@ from a2tg_jax.results.folder import RunFolder
 
 QUICK_SIDE = 640
 """Longer side of photographs, in pixels, up to which the preset quick takes minutes on two cores."""
+LEAST_SIDE = 240
+"""Longer side of photographs, in pixels, below which they are not downscaled for less time."""
 
 
 def training_command(run: RunFolder, out: str, *flags: str) -> str:
@@ -70,6 +72,16 @@ def quick_flags(longest_side: int, downscale: int = 1) -> str:
     """Return the flags of a quick training with photographs of this longer side, already downscaled by a factor."""
     downscale *= max(1, math.ceil(longest_side / QUICK_SIDE))
     return "--preset quick" + (f" --downscale {downscale}" if downscale > 1 else "")
+
+
+def quicker_advice(scene: Path, longest_side: int) -> str:
+    """Return how a scene is trained in less time than by `quick_flags`, with photographs of this longer side."""
+    making = shlex.join(["a2tg", "make", str(scene), "--minutes", "10"])
+    advice = f"{making} chooses size and iterations for that time"
+    downscale = 2 * max(1, math.ceil(longest_side / QUICK_SIDE))
+    if longest_side >= downscale * LEAST_SIDE:
+        advice = f"--downscale {downscale} trains 2 to 3 times as fast; {advice}"
+    return advice
 
 
 def file_command(run: RunFolder, size: str) -> str:

@@ -12,13 +12,12 @@ from jax import Array
 
 from a2tg_jax import Camera, Gaussians, Scene, init_from_points, load_scene, plan_render, render_image, view_image
 from a2tg_jax.base.text import counted, in_bytes
+from a2tg_jax.results.commands import LEAST_SIDE
 
 BYTES_PER_PIXEL = 4.0
 """Bytes of the model for each pixel of a photograph: 0.3 MB at 320×240."""
 GAUSSIANS_PER_PIXEL = 0.07
 """Number of Gaussians in these bytes, for each pixel."""
-LEAST_SIDE = 240
-"""Longer side of photographs, in pixels, below which they are not downscaled."""
 FIRST_DOWNSCALE = 4
 """Factor by which photographs are downscaled to measure the machine."""
 ITERATIONS = 3_000
@@ -125,7 +124,8 @@ def training_within(seconds: float, speed: Speed, size: tuple[int, int], downsca
         least = (LEAST_ITERATIONS * step + speed.other_seconds) / (1 - OTHER_SHARE)
         raise ValueError(
             f"minutes are too few: {max(seconds, 0) / 60:.1f} are left to train, and this machine needs "
-            f"{math.ceil(least / 6) / 10} at least, as busy as now"
+            f"{math.ceil(least / 6) / 10} at least, as busy as now; repeat the command with more: the cameras "
+            "that were found are kept"
         )
     expected = iterations * step + speed.other_seconds + OTHER_SHARE * seconds
     budget = round(BYTES_PER_PIXEL * width * height / 1e6, 2)
