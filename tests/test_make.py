@@ -5,8 +5,10 @@ import re
 import signal
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
+from jax.experimental.compilation_cache.compilation_cache import reset_cache
 from PIL import Image
 
 import a2tg_jax as a2tg
@@ -18,6 +20,7 @@ from a2tg_jax.results.record import read_record
 
 SPEED = Speed(pixel_seconds=4e-7, other_seconds=30)
 """About two cores of a laptop."""
+CACHE_OPTIONS = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
 
 
 @pytest.mark.parametrize("size", [(320, 240), (640, 480), (1000, 750), (250, 1000)])
@@ -54,6 +57,25 @@ def test_too_few_minutes_are_refused_with_the_number_that_is_needed():
 def test_the_speed_is_of_a_gradient():
     speed = measured_speed(a2tg.synthetic_scene(num_views=4, width=32, height=24))
     assert 1e-9 < speed.pixel_seconds < 1e-2 and speed.other_seconds > 0.1
+
+
+def test_the_speed_is_measured_without_programs_on_disk(tmp_path):
+    """The second time, reading the gradient from disk would pass for a machine that compiles in no time."""
+    before = {name: jax.config.values[name] for name in CACHE_OPTIONS}
+    for name, value in zip(CACHE_OPTIONS, (str(tmp_path), 0.0), strict=True):
+        jax.config.update(name, value)
+    reset_cache()
+    try:
+        measured_speed(a2tg.synthetic_scene(num_views=4, width=36, height=24))
+        assert jax.config.values["jax_compilation_cache_dir"] == str(tmp_path)
+        jax.block_until_ready(jax.jit(lambda x: x * 3 + 1)(np.ones(7)))
+    finally:
+        for name, value in before.items():
+            jax.config.update(name, value)
+        reset_cache()
+    kept = [path.name for path in tmp_path.iterdir()]
+    assert any(name.startswith("jit__lambda") for name in kept), "other programs are kept, also afterwards"
+    assert not any(name.startswith("jit_loss") for name in kept)
 
 
 def write_scene(folder):

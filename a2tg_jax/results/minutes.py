@@ -1,16 +1,29 @@
 """Choice of a training that fits into given minutes on this machine: size of the photographs, bytes, iterations."""
 
+import contextlib
 import dataclasses
 import math
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
-from a2tg_jax import Camera, Gaussians, Scene, init_from_points, load_scene, plan_render, render_image, view_image
+from a2tg_jax import (
+    Camera,
+    Gaussians,
+    Scene,
+    View,
+    init_from_points,
+    load_scene,
+    plan_render,
+    render_image,
+    view_image,
+)
 from a2tg_jax.base.text import counted, in_bytes
 from a2tg_jax.results.commands import LEAST_SIDE
 
@@ -144,14 +157,30 @@ def measured_speed(scene: Scene) -> Speed:
         return jnp.mean(jnp.abs(image - photograph))
 
     gradient = jax.jit(jax.value_and_grad(loss))
-    times = []
-    for view in (views[0], *views):  # The first one compiles.
+
+    def seconds_of(view: View) -> float:
         photograph = view_image(view)
         started = time.perf_counter()
         jax.block_until_ready(gradient(gaussians, view.camera, photograph))
-        times.append(time.perf_counter() - started)
-    pixel_seconds = STEP * float(np.median(times[1:])) / (width * height)
-    return Speed(pixel_seconds, OVERHEAD * times[0])
+        return time.perf_counter() - started
+
+    with _compiled_anew():
+        compiling = seconds_of(views[0])
+    pixel_seconds = STEP * float(np.median([seconds_of(view) for view in views])) / (width * height)
+    return Speed(pixel_seconds, OVERHEAD * compiling)
+
+
+@contextlib.contextmanager
+def _compiled_anew() -> Iterator[None]:
+    """Read no compiled program from disk within the block: it would hide how long this machine compiles."""
+    folder = jax.config.values["jax_compilation_cache_dir"]
+    jax.config.update("jax_compilation_cache_dir", None)
+    reset_cache()  # JAX looks at the option only once.
+    try:
+        yield
+    finally:
+        jax.config.update("jax_compilation_cache_dir", folder)
+        reset_cache()
 
 
 def _size(scene: Scene) -> tuple[int, int]:
