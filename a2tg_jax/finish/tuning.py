@@ -317,6 +317,7 @@ def tune_compact(
         corrections=tuple(_held(type(each))(**each.__dict__) for each in stage.corrections),  # type: ignore[arg-type]
         # The model has its final degrees.
         raises_sh_degree=False,
+        num_coarse=0,
         cools_down=True,
     )
     shared = {field.name: getattr(system, field.name) for field in dataclasses.fields(System)}

@@ -19,6 +19,7 @@ from a2tg_jax.systems.two_stages import PRUNING, LimitExponents, TwoStages, kern
 from a2tg_jax.training.stage import Stage
 
 QUICK_CAP = 40_000
+QUICK_COARSE_SHARE = 0.4
 SMOKE_CAP = 2_000
 
 
@@ -69,7 +70,7 @@ class Bytewise(TwoStages):
     """Options of the texture lookup."""
 
     name: ClassVar[str] = "bytewise"
-    version: ClassVar[int] = 6
+    version: ClassVar[int] = 7
 
     @property
     def initial_sh_degree(self) -> int:
@@ -138,7 +139,8 @@ class Bytewise(TwoStages):
     @classmethod
     def presets(cls) -> dict[str, Self]:
         smoke = {"stage2_iterations": 120, "densify": SplitByGradient(SMOKE_CAP)}
-        return cls.short_presets({"densify": SplitByGradient(QUICK_CAP)}, smoke)
+        quick = {"densify": SplitByGradient(QUICK_CAP), "coarse_share": QUICK_COARSE_SHARE}
+        return cls.short_presets(quick, smoke)
 
     def check_options(self) -> None:
         super().check_options()

@@ -47,8 +47,15 @@ class TwoStages(System):
     """Iterations of the first stage."""
     stage2_iterations: int = 30_000
     """Iterations of the second stage."""
+    coarse_share: float = 0.0
+    """Share of the first stage, from its beginning, with photographs of half the width and height, which take less
+    time; 0: none. Photographs of less than 128 pixels stay whole."""
     floaters: PruneFloaters = PruneFloaters(min_views=0)
     """Pruning of floaters in the first stage."""
+
+    def check_options(self) -> None:
+        super().check_options()
+        check_number("coarse_share", self.coarse_share, least=0, most=1)
 
     @classmethod
     def short_presets(cls, quick: dict[str, Any], smoke: dict[str, Any]) -> dict[str, Self]:
@@ -80,7 +87,7 @@ class TwoStages(System):
             events = (*events, floaters)
         return Stage(
             name, appearance, events, self.loss.terms(), self.rates, length, appearance_rate, self.corrections_of(0),
-            raises_sh_degree=True,
+            raises_sh_degree=True, num_coarse=round(self.coarse_share * length),
         )  # fmt: skip
 
     def later_stage(

@@ -6,6 +6,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.sharding import Mesh
@@ -60,6 +61,34 @@ class Photographs(NamedTuple):
         if batch.depths is not None:
             batch = batch._replace(depths=batch.depths.astype(dtype))
         return batch
+
+    def halved(self) -> "Photographs":
+        """Return the views at half the width and height, in floats; traced.
+
+        A pixel is the mean of four, weighed by their opacities; it counts, and has a depth, if all four do. A last odd
+        row or column is left out.
+        """
+        height, width = (side // 2 for side in self.images.shape[1:3])
+        dtype = self.Ks.dtype
+
+        def fours(x: Array) -> Array:
+            """Return the four pixels of each pixel along the third and fifth axes [V, H/2, 2, W/2, 2, ...]."""
+            return x[:, : 2 * height, : 2 * width].reshape(len(x), height, 2, width, 2, *x.shape[3:])
+
+        def means(x: Array) -> Array:
+            return jnp.mean(fours(x.astype(dtype)), axis=(2, 4))
+
+        images = means(self.images)
+        alphas = None
+        if self.alphas is not None:
+            alphas = means(self.alphas)
+            weights = self.alphas.astype(dtype)[..., None]
+            images = means(weights * self.images.astype(dtype)) / jnp.maximum(alphas, np.finfo(dtype).tiny)[..., None]
+        masks = None if self.masks is None else jnp.all(fours(self.masks), axis=(2, 4))
+        depths = None if self.depths is None else means(self.depths)
+        rays = None if self.rays is None else means(self.rays[None])[0] / 2
+        Ks = self.Ks * jnp.asarray([[[0.5], [0.5], [1.0]]], dtype)
+        return Photographs(self.viewmats, Ks, images, alphas, masks, depths, rays)
 
 
 def over_background(image: Array, alpha: Array | None, background: Array) -> Array:

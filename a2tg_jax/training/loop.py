@@ -18,6 +18,7 @@ import numpy as np
 from a2tg_jax.base.even_spacing import evenly_chosen
 from a2tg_jax.base.machine import Devices
 from a2tg_jax.base.text import in_bytes
+from a2tg_jax.core.cameras import resize_camera
 from a2tg_jax.core.compilations import compilations
 from a2tg_jax.core.table import Layout
 from a2tg_jax.events import Due, HostEvent, StepEvent
@@ -63,6 +64,8 @@ LEAST_SHORTENED = 100
 """Smallest number of these steps, if as many iterations are left."""
 GROWTH_ROOM = 1.5
 """Pairs that lists may reach while a model is trained, as a multiple of the present ones."""
+LEAST_HALVED = 128
+"""Least width and height of photographs that are halved in a stage's first iterations, in pixels."""
 
 Size = tuple[int, int]
 """Height and width of a view, in pixels."""
@@ -93,6 +96,12 @@ def are_events_decided_by_host(state: TrainState) -> bool:
     """
     devices = state.model.gaussians.means.devices()
     return all(device.platform != "cpu" for device in devices)
+
+
+def drawn_size(size: Size, *, is_halved: bool) -> Size:
+    """Return the size at which views of a size are drawn."""
+    height, width = size
+    return (height // 2, width // 2) if is_halved else size
 
 
 def is_multiple_between(before: int, after: int, every: int) -> bool:
@@ -223,7 +232,7 @@ class StageRun:
         self._progress = progress
         self._pace = self._pace_from(self._launched)
         self.capacities: dict[Size, int] = {}
-        """Capacities of the tile lists that steps are compiled for."""
+        """Capacities of the tile lists that steps are compiled for, by the size of the render."""
         self.memory: float | None = None
         """Bytes in use while a step runs; None: no step is compiled yet."""
         self._max_memory = max_memory
@@ -332,7 +341,10 @@ class StageRun:
 
     def _pace_from(self, iteration: int) -> Pace:
         most = max((event.most_gaussians or 0 for event in self.stage.events), default=0)
-        return Pace(iteration, self.stage.iterations, most_gaussians=most, after=self._progress.after)
+        num_halved = self.stage.num_coarse if self._is_halved(1) else 0
+        return Pace(
+            iteration, self.stage.iterations, most_gaussians=most, num_halved=num_halved, after=self._progress.after
+        )
 
     def _log(self, iteration: int, info: StepInfo, on_log: OnLog | None) -> None:
         """Add a row to the history."""
@@ -378,13 +390,17 @@ class StageRun:
 
     def _launch(self, iteration: int) -> StepInfo:
         arguments = self.arguments(iteration)
+        # Of halved photographs a step takes less memory than later ones, which decide whether training fits.
+        largest = arguments
+        if self.memory is None and arguments[0].is_halved:
+            largest = self.arguments(iteration, may_halve=False)
         started = time.perf_counter()
         info: StepInfo
         with compilations() as phases:
             try:
                 if self.memory is None:
                     # The call that follows finds this program, in JAX's cache of this process.
-                    step = jitted_step().lower(*arguments).compile()
+                    step = jitted_step().lower(*largest).compile()
                     model_bytes = sum(leaf.nbytes for leaf in jax.tree.leaves(self.state.model))
                     self.memory = check_step_fits(
                         step, model_bytes, self._progress.after, self.system, self.session.devices, self._max_memory
@@ -398,15 +414,16 @@ class StageRun:
             self.session.after_compiling()
         return info
 
-    def arguments(self, iteration: int) -> tuple[StepSettings, TrainState, StepInputs]:
-        """Return the arguments of the step of an iteration."""
+    def arguments(self, iteration: int, *, may_halve: bool = True) -> tuple[StepSettings, TrainState, StepInputs]:
+        """Return the arguments of the step of an iteration; with `may_halve` False, photographs are whole."""
         photographs, chosen = self.photographs.batch(iteration)
-        render = self.render_settings(self._size(iteration))
+        is_halved = may_halve and self._is_halved(iteration)
+        render = self.render_settings(self._size(iteration), is_halved=is_halved)
         clock = self.stage.clock(iteration, self.largest_loss, iteration - self._launched)
         happens = None
         if are_events_decided_by_host(self.state):
             happens = tuple(left is None or left > 0 for left in clock.num_left)
-        settings = StepSettings(render, self.system.background, happens, self.mesh)
+        settings = StepSettings(render, self.system.background, happens, self.mesh, is_halved)
         views = np.asarray(self.order.indices(iteration), np.int32) if self.stage.corrections else None
         views = everywhere(self.mesh, views)
         inputs = StepInputs(self.stage, clock, photographs, chosen, views, self.scene_scale, self.key)
@@ -415,25 +432,32 @@ class StageRun:
     def _size(self, iteration: int) -> Size:
         return self.views[self.order.indices(iteration)[0]].picture.size
 
-    def render_settings(self, size: Size) -> RenderSettings:
-        """Return settings with a capacity for the views of a size. The first call plans it, for a sample of these views
-        and for a model that uses all its rows."""
+    def _is_halved(self, iteration: int) -> bool:
+        """Return whether the photographs of an iteration are halved; small ones never are."""
+        return iteration <= self.stage.num_coarse and min(self._size(iteration)) >= LEAST_HALVED
+
+    def render_settings(self, size: Size, *, is_halved: bool) -> RenderSettings:
+        """Return settings with a capacity for the views of a size, drawn at half of it or whole. The first call plans
+        it, for a sample of these views and for a model that uses all its rows."""
         settings = RenderSettings(tile_size=self.system.tile_size)
         model = self.state.model
-        if size not in self.capacities:
+        drawn = drawn_size(size, is_halved=is_halved)
+        if drawn not in self.capacities:
             dtype = model.gaussians.means.dtype
             appearance = model.appearance
+            height, width = drawn
             views = [view for view in self.views if view.picture.size == size]
             sample = evenly_chosen(views, PLANNED_VIEWS)
-            cameras = [jax.tree.map(lambda x: jnp.asarray(x, dtype), view.camera) for view in sample]
+            cameras = [view.camera if not is_halved else resize_camera(view.camera, width, height) for view in sample]
+            cameras = [jax.tree.map(lambda x: jnp.asarray(x, dtype), camera) for camera in cameras]
             pairs = most_pairs(model.gaussians, cameras, appearance, settings, model.num_live)
             growth = (model.num_rows / max(model.num, 1)) ** 0.5
-            self.capacities[size] = self.session.room.plan(self._place(size), pairs * GROWTH_ROOM * growth)
-        return dataclasses.replace(settings, capacity=self.capacities[size])
+            self.capacities[drawn] = self.session.room.plan(self._place(drawn), pairs * GROWTH_ROOM * growth)
+        return dataclasses.replace(settings, capacity=self.capacities[drawn])
 
-    def _place(self, size: Size) -> tuple[object, ...]:
+    def _place(self, drawn: Size) -> tuple[object, ...]:
         """Return the place of a capacity in the session's room: stages that show the same share it."""
-        return self.stage.appearance, self.state.model.num_rows, *size
+        return self.stage.appearance, self.state.model.num_rows, *drawn
 
     def _after_failure(self, iteration: int, info: StepInfo) -> None:
         """Make more room if the tile lists of a step overflowed; raise an error for every other cause."""
@@ -441,9 +465,9 @@ class StageRun:
         self.state = dataclasses.replace(self.state, status=jnp.zeros_like(self.state.status))
         if info.status == OVERFLOW:
             self.num_regrown += 1
-            size = self._size(iteration)
+            drawn = drawn_size(self._size(iteration), is_halved=self._is_halved(iteration))
             pairs = GROWTH_ROOM * float(info.num_pairs)
-            self.capacities[size] = self.session.room.enlarge(self._place(size), pairs)
+            self.capacities[drawn] = self.session.room.enlarge(self._place(drawn), pairs)
             return
         where = f"at iteration {iteration} of stage {self.stage.name}"
         if info.status in (NOT_FINITE, EXPLODED):

@@ -261,7 +261,9 @@ class System(NamedFields):
         if not self.more:
             return stages
         last = stages[-1]
-        further = dataclasses.replace(last, events=last.lasting_events, raises_sh_degree=False, continues=True)
+        further = dataclasses.replace(
+            last, events=last.lasting_events, raises_sh_degree=False, num_coarse=0, continues=True
+        )
         names = ["more", *(f"more-{number}" for number in range(2, len(self.more) + 1))]
         pairs = zip(names, self.more, strict=True)
         return (*stages, *(dataclasses.replace(further, name=name, iterations=length) for name, length in pairs))

@@ -28,6 +28,8 @@ TIMED_SECONDS = 2.0
 """Least time of the steps from which a duration is forecast."""
 TIMED_STEPS = 3
 """Least number of these steps."""
+HALVED_WORK = 0.6
+"""Time of an iteration with halved photographs, as a share of one with whole photographs, about."""
 
 
 class RestOfRun(NamedTuple):
@@ -90,17 +92,19 @@ class Pace:
 
     def __init__(
         self, first: int, total: int, now: Callable[[], float] = time.perf_counter, *, most_gaussians: int = 0,
-        after: RestOfRun = RestOfRun(),  # noqa: B008 - immutable
+        num_halved: int = 0, after: RestOfRun = RestOfRun(),  # noqa: B008 - immutable
     ):  # fmt: skip
         """`first` iterations were done before, `total` is the last one, and `now` is a clock in seconds. Gaussians grow
-        to at most `most_gaussians`; 0: they do not."""
+        to at most `most_gaussians`; 0: they do not. In the first `num_halved` iterations photographs are halved."""
         self._total = total
+        self._num_halved = num_halved
         self._now = now
         self._most = most_gaussians
         self._after = after
         self._told_at = [first, (first + total) // 2]
         self._before: tuple[int, float, int] | None = None
         self._steps = 0
+        self._work = 0.0
         self._seconds = 0.0
         self._ahead = 0
         self._seconds_a_program = 0.0
@@ -117,6 +121,7 @@ class Pace:
             done_before, before, num_compiled_before = self._before
             if num_compiled == num_compiled_before:
                 self._steps += done - done_before
+                self._work += self._work_of(done_before, done)
                 self._seconds += now - before
         self._before = done, now, num_compiled
 
@@ -132,6 +137,7 @@ class Pace:
         pace = f"{1e3 * self._seconds / self._steps:,.0f} ms an iteration"
         self._told_at = [later for later in self._told_at[1:] if later > done]
         self._steps = 0
+        self._work = 0.0
         self._seconds = 0.0
         return f"{pace}, about {left} left{compiling}{growing}"
 
@@ -139,9 +145,15 @@ class Pace:
         """Return the remaining time of the run, known compilations included; None before a step was timed."""
         if self._steps == 0:
             return None
-        of_steps = (self._total - done + self._after.iterations) * self._seconds / self._steps
+        work = self._work_of(done, self._total) + self._after.iterations
+        of_steps = work * self._seconds / self._work
         programs = self._ahead + self._after.programs
         return datetime.timedelta(seconds=round(of_steps + programs * self._seconds_a_program))
+
+    def _work_of(self, first: int, last: int) -> float:
+        """Return the work of the iterations after `first` up to `last`, in iterations with whole photographs."""
+        num_halved = min(last, self._num_halved) - min(first, self._num_halved)
+        return last - first - (1 - HALVED_WORK) * num_halved
 
 
 CHECKED_AFTER = 0.2

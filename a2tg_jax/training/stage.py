@@ -122,6 +122,8 @@ class Stage(NamedFields):
     continues: bool = static(default=False)
     """Whether this stage continues the one before: it begins with its last state, Adam's moments included, and all
     schedules, such as learning rates, stay at their end."""
+    num_coarse: int = beside(default=0)
+    """Number of first iterations with photographs of half the width and height (`Photographs.halved`)."""
 
     @property
     def statistic(self) -> Statistic | None:

@@ -71,6 +71,8 @@ class StepSettings:
     which makes a GPU wait for the host."""
     mesh: Mesh | None = None
     """Devices that draw the views; None: one."""
+    is_halved: bool = False
+    """Whether photographs are halved (`Photographs.halved`)."""
 
 
 class StepInputs(NamedTuple):
@@ -184,6 +186,7 @@ def attempt(settings: StepSettings, state: TrainState, inputs: StepInputs) -> At
     keys = jax.random.split(jax.random.fold_in(inputs.key, iteration), 1 + num_keys)
     dtype = model.gaussians.means.dtype
     batch = inputs.photographs.of(inputs.chosen, dtype)
+    batch = batch.halved() if settings.is_halved else batch
     if settings.background == "random":
         backgrounds = jax.random.uniform(keys[0], (len(batch.viewmats), 3), dtype)
     else:

@@ -11,7 +11,7 @@ import a2tg_jax as a2tg
 from a2tg_jax.results.plan import common_options
 
 PACKAGE = "a2tg_jax"
-LATER_FIELDS = {"continues", "extent"}
+LATER_FIELDS = {"continues", "extent", "num_coarse"}
 """Fields that came after the first records, which keep their keys: at their default they are no part of a fingerprint.
 """
 TILE_SIZE = 8
