@@ -56,6 +56,10 @@ class Sfm:
     """Lens to estimate. OPENCV suits wide lenses, OPENCV_FISHEYE action cameras such as GoPro's."""
 
     def run(self) -> None:
+        print(self.find_cameras())
+
+    def find_cameras(self) -> str:
+        """Write the scene folder, and return how to continue with it."""
         from a2tg_jax.data.load import is_scene
         from a2tg_jax.data.photo_folder import CAMERA_PICTURE
         from a2tg_jax.data.sfm import run_sfm
@@ -97,8 +101,9 @@ class Sfm:
                 f"only {summary.num_registered} of {summary.num_photos} photographs have a camera, so that {out} shows "
                 f"less than you photographed; the warnings say what may help. To train it all the same: {command}"
             )
-        print(f"cameras: {out / CAMERA_PICTURE}\nscene: {out}; continue with: {command}")
-        print(f"quicker: {quicker_advice(out, summary.longest_side)}")
+        print(f"cameras: {out / CAMERA_PICTURE}", flush=True)
+        quicker = quicker_advice(out, summary.longest_side)
+        return f"scene: {out}; continue with: {command}\nquicker: {quicker}"
 
     def _places(self) -> tuple[list[Path], Path]:
         """Return the sources and the scene folder."""

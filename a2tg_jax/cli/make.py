@@ -153,4 +153,8 @@ def check_unchanged(photographs: dict[str, list[int]], out: Path) -> None:
 def run_step(name: str, words: Sequence[str]) -> None:
     """Print a command and run it."""
     print_now(f"$ {shlex.join(['a2tg', name, *words])}")
-    parsed(name, words).run()
+    command = parsed(name, words)
+    if name == "sfm":
+        command.find_cameras()  # The next step follows, so that no advice how to continue is needed.
+    else:
+        command.run()
