@@ -41,8 +41,8 @@ MOST_ITERATIONS = 30_000
 NUM_TIMED = 5
 """Number of timed gradients; the median counts."""
 STEP = 2.4
-"""Mean time of a training step of `bytewise` in `quick`, its events included, as a multiple of the time of a gradient of
-the initial Gaussians, on two cores."""
+"""Mean time of a training step of `bytewise` in `quick` with its events, as a multiple of the time of a gradient of the
+initial Gaussians, on two cores."""
 OVERHEAD = 25.0
 """Time in which a training compiles, is evaluated, and gets its page and turntable, as a multiple of the time in which
 this gradient compiles."""
