@@ -102,10 +102,11 @@ def cameras_of(found, work):
 
 def test_cameras_are_distinguished_and_exif_gives_their_focal_length(tmp_path):
     """Photographs of one folder, size and lens share a camera. One that is turned keeps its EXIF data."""
-    image = Image.fromarray(np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8))
-    for name, size in (("a/1.png", (64, 48)), ("a/2.png", (64, 48)), ("a/3.png", (32, 24)), ("b/1.png", (64, 48))):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        image.resize(size).save(tmp_path / name)
+    random = np.random.default_rng(0)
+    sizes = {"a/1.png": (64, 48), "a/2.png": (64, 48), "a/3.png": (32, 24), "b/1.png": (64, 48)}
+    for name, size in sizes.items():
+        save_blocks(tmp_path / name, *size, random)
+    image = Image.fromarray(random.integers(0, 255, (48, 64, 3), np.uint8))
     save_turned(image, tmp_path / "b" / "2.jpg", 6)
     found = staged([tmp_path / "a", tmp_path / "b"], tmp_path / "work")
     assert {group.names: group.size for group in found.groups} == {
@@ -185,10 +186,10 @@ COLOUR = np.kron(np.random.default_rng(0).integers(0, 255, (4, 6, 3)), np.ones((
 def test_colmap_reads_and_writes_every_photograph(tmp_path, name, mode, options):
     """The formats and their variants, and files of another format than their suffix says."""
     (tmp_path / "photos").mkdir()
-    Image.fromarray(COLOUR).convert(mode).save(tmp_path / "photos" / name, **options)
+    for index, prefix in enumerate(("", "x-", "y-")):
+        shifted = Image.fromarray(np.roll(COLOUR, 9 * index, axis=1))
+        shifted.convert(mode).save(tmp_path / "photos" / f"{prefix}{name}", **options)
     expected = read_pixels(tmp_path / "photos" / name)
-    for index in range(1, 3):
-        os.link(tmp_path / "photos" / name, tmp_path / "photos" / f"{index}-{name}")
     (group,) = staged([tmp_path / "photos"], tmp_path / "work").groups
     assert len(group.names) == 3 and group.size == (96, 64)
     bitmap = pycolmap().Bitmap.read(tmp_path / "work" / "photos" / group.names[0], True)
@@ -202,8 +203,10 @@ def test_transparent_photographs_are_staged_as_png(tmp_path):
     photos = tmp_path / "photos"
     image = Image.fromarray(pixels)
     photos.mkdir()
-    for name in ("0.png", "1.tif", "3.PNG"):
+    for name in ("0.png", "1.tif"):
         image.save(photos / name)
+    # Other bytes than 0.png, but the same pixels.
+    image.save(photos / "3.PNG", compress_level=0)
     image.save(photos / "2.webp", lossless=True, exact=True)
     save_turned(image, photos / "4.png", 6)
     image.convert("LA").save(photos / "5.png")
@@ -284,7 +287,7 @@ def test_masked_pixels_have_no_features(tmp_path):
         (tmp_path / folder).mkdir()
     for name in ("0", "1", "2"):
         picture = Image.fromarray(noise).resize((256, 192), Image.Resampling.BICUBIC)
-        picture.save(tmp_path / "photos" / f"{name}.png")
+        picture.save(tmp_path / "photos" / f"{name}.png", compress_level=int(name))
     Image.fromarray(np.arange(256) >= 128 * np.ones((192, 1))).convert("L").save(tmp_path / "cut" / "0.png")
     with pytest.warns(UserWarning, match="2 of 3 photographs have no mask"):
         found = staged([tmp_path / "photos"], tmp_path / "work", masks=tmp_path / "cut")
@@ -318,7 +321,7 @@ def test_what_is_wrong_with_masks_of_photographs(tmp_path):
 def test_grey_masks_of_photographs_are_named(tmp_path, panorama):
     """And masks of 16 and 235, as frames of videos have, are staged black and white."""
     for index in range(3):
-        save_blocks(tmp_path / "photos" / f"{index}.jpg", 64, 32, np.random.default_rng(0))
+        save_blocks(tmp_path / "photos" / f"{index}.jpg", 64, 32, np.random.default_rng(index))
         (tmp_path / "cut").mkdir(exist_ok=True)
         levels = np.where(np.arange(64) < 32, 235, 100 if index == 1 else 16) * np.ones((32, 1))
         Image.fromarray(levels.astype(np.uint8)).save(tmp_path / "cut" / f"{index}.png")
@@ -339,7 +342,7 @@ def test_masks_of_panoramas_are_cut(tmp_path):
     (tmp_path / "cut").mkdir()
     (tmp_path / "photos").mkdir()
     for index in range(3):
-        Image.fromarray(pixels).save(tmp_path / "photos" / f"{index}.png")
+        Image.fromarray(pixels).save(tmp_path / "photos" / f"{index}.png", compress_level=index)
         Image.fromarray(np.arange(64)[:, None] * np.ones(128) >= 32).convert("L").save(
             tmp_path / "cut" / f"{index}.png"
         )
@@ -640,6 +643,34 @@ def test_photographs_may_be_listed(tmp_path):
     (tmp_path / "a" / "clip.insv").touch()
     with pytest.raises(ValueError, match=r"clip.insv: is a recording of Insta360"):
         staged([*listed[:3], tmp_path / "a" / "clip.insv"], tmp_path / "five")
+
+
+def test_photographs_with_the_same_bytes_are_left_out_and_named(tmp_path):
+    """Of one source and of several, under any name. A file of equal size with other bytes is kept."""
+    random = np.random.default_rng(0)
+    for name in ("a/0.bmp", "a/1.bmp", "a/2.bmp", "b/0.bmp"):
+        save_blocks(tmp_path / name, 64, 48, random)
+    for copy, name in (("a/9.bmp", "a/1.bmp"), ("b/other.bmp", "a/0.bmp")):
+        shutil.copyfile(tmp_path / name, tmp_path / copy)
+    sizes = {file.stat().st_size for file in tmp_path.glob("?/*.bmp")}
+    assert len(sizes) == 1
+    with pytest.warns(UserWarning, match=r"^left out 1 photograph with the same bytes as another: 9\.bmp of 1\.bmp$"):
+        assert staged([tmp_path / "a"], tmp_path / "one").names == ["0.bmp", "1.bmp", "2.bmp"]
+    with pytest.warns(UserWarning, match=r"left out 2 photographs .*: a/9\.bmp of a/1\.bmp, b/other\.bmp of a/0\.bmp$"):
+        names = staged([tmp_path / "a", tmp_path / "b"], tmp_path / "two").names
+    assert names == ["a/0.bmp", "a/1.bmp", "a/2.bmp", "b/0.bmp"]
+
+
+def test_all_photographs_that_cannot_be_read_are_named_at_once(tmp_path):
+    """Also those that would be compared with another of their name."""
+    random = np.random.default_rng(0)
+    for index in range(4):
+        save_blocks(tmp_path / "photos" / f"{index}.png", 64, 48, random)
+    photos_of(tmp_path / "photos", "1.png", "8.jpg", "sub/1.jpg", data=b"no image")
+    (tmp_path / "photos" / "9.jpg").write_bytes(b"")
+    message = r"^\S*photos/1\.png: cannot be read .*; replace or remove it\. 3 more cannot be used: "
+    with pytest.raises(ValueError, match=rf"{message}\S*photos/8\.jpg, \S*photos/9\.jpg, \S*photos/sub/1\.jpg$"):
+        staged([tmp_path / "photos"], tmp_path / "work")
 
 
 def photos_of(folder, *names, data=b"no image"):

@@ -199,7 +199,7 @@ def test_metadata_decide(tmp_path, text, is_whole, suffix):
     info = PngImagePlugin.PngInfo()
     info.add_itxt("XML:com.adobe.xmp", xmp.decode())
     for index in range(3):
-        white = Image.new("RGB", (64, 32), "white")
+        white = Image.new("RGB", (64, 32), (255 - 40 * index,) * 3)
         white.save(tmp_path / f"{index}{suffix}", **({"pnginfo": info} if suffix == ".png" else {"xmp": xmp}))
     assert picture_facts(tmp_path / f"0{suffix}").is_panorama == is_whole
     with nullcontext() if is_whole is not None else pytest.warns(UserWarning, match="3 pictures twice as wide as high"):
@@ -209,14 +209,15 @@ def test_metadata_decide(tmp_path, text, is_whole, suffix):
 
 def test_unclear_pictures_are_what_most_of_their_source_and_size_are(tmp_path, panorama):
     small = panorama[::4, ::4]
-    pictures = {"a/0": small, "a/1": small, "a/2": np.full_like(small, 255), "b/0": small[::2, ::2]}
-    pictures["b/1"] = pictures["b/2"] = np.full_like(pictures["b/0"], 255)
+    turned = np.roll(small, 9, axis=1)
+    pictures = {"a/0": small, "a/1": turned, "a/2": np.full_like(small, 255), "b/0": small[::2, ::2]}
+    pictures |= {"b/1": np.full_like(pictures["b/0"], 255), "b/2": np.full_like(pictures["b/0"], 254)}
     for name, pixels in pictures.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         Image.fromarray(pixels).save(tmp_path / f"{name}.png")
     found = staged([tmp_path / "a", tmp_path / "b"], tmp_path / "work")
     assert sorted(len(rig.groups[0].names) for rig in found.rigs) == [3, 3] and not found.groups
-    Image.fromarray(np.full((80, 160, 3), 255, np.uint8)).save(tmp_path / "b" / "3.png")
+    Image.fromarray(np.full((80, 160, 3), 250, np.uint8)).save(tmp_path / "b" / "3.png")
     with pytest.warns(UserWarning, match=r"1 picture twice as wide as high, such as b/3.png: .* `panorama` yes cuts"):
         found = staged([tmp_path / "a", tmp_path / "b"], tmp_path / "other")
     assert [group.names for group in found.groups] == [("b/3.png",)]
@@ -224,7 +225,7 @@ def test_unclear_pictures_are_what_most_of_their_source_and_size_are(tmp_path, p
 
 def test_fisheyes_are_refused(tmp_path, panorama):
     for index in range(3):
-        Image.fromarray(fisheyes(panorama)).save(tmp_path / f"{index}.png")
+        Image.fromarray(fisheyes(panorama)).save(tmp_path / f"{index}.png", compress_level=index)
     with pytest.raises(ValueError, match=r"0\.png: shows two fisheyes side by side.*: stitch them first"):
         staged([tmp_path], tmp_path / "work")
     assert not staged([tmp_path], tmp_path / "other", "no").rigs
@@ -234,7 +235,7 @@ def test_fisheyes_are_refused(tmp_path, panorama):
 def test_panoramas_become_a_rig(tmp_path, panorama, choice):
     """The views of one panorama share a place: a frame of the rig, with cameras that are known."""
     for index in range(3):
-        Image.fromarray(panorama[::4, ::4]).save(tmp_path / f"{index}.png")
+        Image.fromarray(panorama[::4, ::4]).save(tmp_path / f"{index}.png", compress_level=index)
     printed = []
     found = staged([tmp_path], tmp_path / "work", choice, printed.append)
     cameras, frames = cameras_of(found, tmp_path)

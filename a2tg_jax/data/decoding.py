@@ -49,6 +49,14 @@ MAX_PIXELS = 128_000_000
 """Largest width × height of a decoded picture, which takes up to 1 GB."""
 
 
+class PictureError(ValueError):
+    """An image file that cannot be used: its path, and what is wrong with it and what to do."""
+
+    def __str__(self) -> str:
+        path, text = self.args
+        return f"{path}: {text}"
+
+
 def read_pixels(path: str | os.PathLike[str]) -> np.ndarray:
     """Return the pixels of an image file as stored, without EXIF rotation, because cameras are estimated without it.
 
@@ -188,7 +196,7 @@ def read_grey(path: str | os.PathLike[str]) -> tuple[np.ndarray, int]:
 def _opened(path: str | os.PathLike[str], most_bits: int = 8, is_decoded: bool = True) -> Iterator[Image.Image]:
     """Open an image within the block; its size and bits are checked if it is decoded.
 
-    Every decoding error, in the block too, becomes one ValueError.
+    Every decoding error, in the block too, becomes a PictureError.
     """
     try:
         with open_regular(path, MOST_BYTES) as file, Image.open(file, formats=_formats_of(path, file)) as image:
@@ -202,13 +210,16 @@ def _opened(path: str | os.PathLike[str], most_bits: int = 8, is_decoded: bool =
                 raise ValueError(f"{path}: has more than 8 bits per channel; convert it to an 8-bit image")
             yield image
     except Exception as error:  # Damaged pictures raise anything from SyntaxError to struct.error.
-        if str(error).startswith(f"{path}: "):  # Raised above.
+        beginning = f"{path}: "
+        if str(error).startswith(beginning):  # Raised above, or by a caller.
+            if type(error) is ValueError:
+                raise PictureError(path, str(error).removeprefix(beginning)) from error
             raise
         reason = shortened(str(error) or type(error).__name__, LONGEST_REASON)
         if isinstance(error, UnidentifiedImageError):  # Its text names an object of Python instead of the file.
             known = f"it is none of {', '.join(FORMATS)}"
             reason = known if os.path.getsize(path) else "it is empty: 0 bytes"
-        raise ValueError(f"{path}: cannot be read as an image ({reason}); replace or remove it") from error
+        raise PictureError(path, f"cannot be read as an image ({reason}); replace or remove it") from error
 
 
 def _formats_of(path: str | os.PathLike[str], file: BufferedReader) -> tuple[str, ...]:

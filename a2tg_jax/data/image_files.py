@@ -9,7 +9,8 @@ from pathlib import Path, PurePath, PureWindowsPath
 from typing import TypeVar
 
 from a2tg_jax.base.regular_files import is_regular, names_in
-from a2tg_jax.base.text import counted, shortened
+from a2tg_jax.base.text import counted, first_names, shortened
+from a2tg_jax.data.decoding import PictureError
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".avif")
 """Suffixes of photographs, in lower or upper case."""
@@ -103,6 +104,31 @@ def warn_of_unposed(folder: Path, names: Iterable[str], is_deep: bool = True) ->
 
 
 def map_in_threads(function: Callable[..., Result], *iterables: Iterable[object]) -> list[Result]:
-    """Return list(map(function, *iterables)), run in threads, as decoding of pictures releases Python's lock."""
+    """Return list(map(function, *iterables)), run in threads, as decoding of pictures releases Python's lock.
+
+    Raises:
+      PictureError: naming all pictures that cannot be used, with the reason of the first.
+    """
+
+    def attempt(*arguments: object) -> Result | PictureError:
+        try:
+            return function(*arguments)
+        except PictureError as error:
+            return error
+
+    results: list[Result] = []
+    errors: list[PictureError] = []
     with ThreadPoolExecutor(max_workers=min(MOST_READERS, os.cpu_count() or 1)) as pool:
-        return list(pool.map(function, *iterables))
+        for result in pool.map(attempt, *iterables):
+            if isinstance(result, PictureError):
+                errors.append(result)
+            else:
+                results.append(result)
+    if not errors:
+        return results
+    path, text = errors[0].args
+    # Several calls may read one picture.
+    others = list(dict.fromkeys(str(error.args[0]) for error in errors if error.args[0] != path))
+    if others:
+        text = f"{text}. {len(others)} more cannot be used: {first_names(others)}"
+    raise PictureError(path, text) from errors[0]

@@ -274,8 +274,14 @@ def _copies(folder: Path, names: Sequence[str]) -> set[str]:
             same_name[key].append(name)
     groups = [group for group in same_name.values() if len(group) > 1]
     wanted = sorted(set().union(*groups))
-    thumbnails = map_in_threads(lambda name: upright_thumbnail(folder / name, THUMBNAIL), wanted)
-    pictures = dict(zip(wanted, thumbnails, strict=True))
+
+    def thumbnail(name: str) -> tuple[tuple[int, int], np.ndarray] | None:
+        with contextlib.suppress(ValueError):  # Damaged pictures are reported when all are read.
+            return upright_thumbnail(folder / name, THUMBNAIL)
+        return None
+
+    thumbnails = zip(wanted, map_in_threads(thumbnail, wanted), strict=True)
+    pictures = {name: picture for name, picture in thumbnails if picture is not None}
 
     def is_copy(name: str, larger: str) -> bool:
         """Return whether two pictures have the same aspect, up to a pixel of rounding, and show the same."""
@@ -290,7 +296,7 @@ def _copies(folder: Path, names: Sequence[str]) -> set[str]:
     copies: set[str] = set()
     for group in groups:
         kept: list[str] = []
-        for name in sorted(group, key=lambda name: (-math.prod(pictures[name][0]), name)):
+        for name in sorted(pictures.keys() & group, key=lambda name: (-math.prod(pictures[name][0]), name)):
             if any(is_copy(name, larger) for larger in kept):
                 copies.add(name)
             else:

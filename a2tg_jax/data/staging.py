@@ -18,7 +18,8 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from a2tg_jax.base.text import counted
+from a2tg_jax.base.regular_files import sha256_of
+from a2tg_jax.base.text import counted, first_names
 from a2tg_jax.data.decoding import PictureFacts, picture_facts, read_pixels, save_upright
 from a2tg_jax.data.image_files import map_in_threads, on_disk
 from a2tg_jax.data.lenses import sampled
@@ -151,7 +152,7 @@ def stage(
         return _Photo(source, file, name, facts, _kind_of(file, facts, panorama), mask)
 
     videos = {number for number, source in enumerate(chosen) if is_video(source)}
-    photos = _decided(map_in_threads(look, *zip(*files, strict=True)), videos)
+    photos = _decided(_without_copies(map_in_threads(look, *zip(*files, strict=True))), videos)
     lacking = [photo.name for photo in photos if photo.mask is None]
     if masks is not None:
         if len(lacking) == len(photos):
@@ -176,6 +177,31 @@ def _kind_of(file: Path, facts: PictureFacts, panorama: Panorama) -> Projection:
     if panorama == "yes" or facts.is_panorama:
         return "panorama"
     return projection_of(read_pixels(file)) if facts.is_panorama is None else "photograph"
+
+
+def _without_copies(photos: Sequence[_Photo]) -> list[_Photo]:
+    """Return photographs without those whose file has the same bytes as an earlier one's; warn of these."""
+    of_size: dict[int, list[Path]] = defaultdict(list)
+    for photo in photos:
+        of_size[photo.file.stat().st_size].append(photo.file)
+    alike = [file for files in of_size.values() if len(files) > 1 for file in files]
+    checksums = dict(zip(alike, map_in_threads(sha256_of, alike), strict=True))
+    firsts: dict[str, str] = {}
+    kept = []
+    copies = []
+    for photo in photos:
+        # A file of another size than all others has no checksum, and is no copy.
+        first = firsts.setdefault(checksums.get(photo.file, photo.name), photo.name)
+        if first == photo.name:
+            kept.append(photo)
+        else:
+            copies.append(f"{photo.name} of {first}")
+    if copies:
+        warnings.warn(
+            f"left out {counted(len(copies), 'photograph')} with the same bytes as another: {first_names(copies)}",
+            stacklevel=4,
+        )
+    return kept
 
 
 def _decided(photos: Sequence[_Photo], videos: Container[int]) -> list[_Photo]:
