@@ -37,8 +37,8 @@ class RestOfRun(NamedTuple):
 
     iterations: float = 0.0
     """Time of its steps, as a number of iterations of that stage."""
-    programs: int = 0
-    """Number of programs to compile."""
+    programs: float = 0.0
+    """Time to compile other programs, as a number of compilations of a step."""
     model_bytes: float = 0.0
     """Bytes of the largest model."""
 
