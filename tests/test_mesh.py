@@ -284,6 +284,10 @@ def test_a_mesh_says_how_much_of_the_views_it_lacks(model):
     assert whole.missing < 0.01
     assert part.mesh.area < 0.95 * whole.mesh.area
     assert part.missing > 0.02
+    # The sphere is within half the radius; within half of a smaller one are depths of its rim, far from its surface.
+    assert part.missing_near == part.missing
+    around = a2tg.extract_mesh(model, resolution=40, radius=1.5 * RADIUS, least_weight=0.6)
+    assert around.missing < 0.2 and around.missing_near > 0.9
 
 
 def test_a_grid_alone_has_the_whole_budget(model):

@@ -81,6 +81,9 @@ class MeshResult(NamedFields):
     """Number of small connected parts that cleaning removed."""
     missing: float
     """Share of the pixels of the views, of those with a depth within the radius, where the mesh has no surface."""
+    missing_near: float
+    """The same share of those whose depth is within half the radius: by default the cameras' median distance from the
+    centre, within which the subject is."""
     num_bytes: int
     """Bytes of the voxel grid."""
     seconds: float
@@ -211,10 +214,13 @@ def extract_mesh(
             "there is no surface within the radius around the point that the cameras look at: give a larger `radius`, "
             "or `unbounded`"
         )
-    distances, _ = cKDTree(mesh.vertices).query(np.concatenate(seen))
-    missing = float(np.mean(distances > TRUNCATION * voxel)) if len(distances) else 0.0
+    points = np.concatenate(seen)
+    distances, _ = cKDTree(mesh.vertices).query(points)
+    is_missing = distances > TRUNCATION * voxel
+    is_near = np.linalg.norm(points - center, axis=1) < radius / RADII
+    missing, near = (float(np.mean(some)) if len(some) else 0.0 for some in (is_missing, is_missing[is_near]))
     seconds = time.perf_counter() - start
-    return MeshResult(mesh, center, radius, voxel, len(cameras), num_dropped, missing, num_bytes, seconds)
+    return MeshResult(mesh, center, radius, voxel, len(cameras), num_dropped, missing, near, num_bytes, seconds)
 
 
 def voxels_of_levels(voxel: float, radius: float) -> list[float]:

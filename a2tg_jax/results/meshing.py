@@ -10,7 +10,7 @@ from a2tg_jax import Origin, Renderer, view_image
 from a2tg_jax.base.memory import memory_limit
 from a2tg_jax.base.text import budget_in_bytes, counted, in_bytes
 from a2tg_jax.host.progress_bars import progress_over
-from a2tg_jax.mesh.extract import check_lengths, extract_mesh
+from a2tg_jax.mesh.extract import RADII, check_lengths, extract_mesh
 from a2tg_jax.mesh.files import check_mesh_suffix, save_mesh
 from a2tg_jax.mesh.texturing import Picture, check_texture, texture_mesh
 from a2tg_jax.mesh.triangles import check_simplifying, simplify_mesh
@@ -82,12 +82,14 @@ def write_mesh(
     files = save_mesh(out, mesh, origin)
     size = in_bytes(sum(file.stat().st_size for file in files))
     texture = "" if mesh.texture is None else f", a texture of {mesh.texture.shape[1]} × {mesh.texture.shape[0]}"
+    near_radius = result.radius / scale / RADII
     return "\n".join(
         [
             f"fused {counted(result.num_views, 'view')} at voxels of {result.voxel / scale:.3g}, within "
             f"{result.radius / scale:.3g} of the centre ({in_bytes(result.num_bytes)} of voxels)",
             f"left out {counted(result.num_dropped, 'small part')}",
-            f"{100 * result.missing:.0f} % of what the views show has no surface"
+            f"{100 * result.missing:.0f} % of what the views show has no surface, {100 * result.missing_near:.0f} % "
+            f"within {near_radius:.3g} of the centre, where the subject is"
             f"{MANY_HOLES if result.missing > MUCH_MISSING else ''}",
             f"mesh: {mesh.num_vertices:,} vertices, {mesh.num_faces:,} faces{texture}, {size}, "
             f"{time.perf_counter() - start:.0f} s",
