@@ -196,6 +196,14 @@ def resize_camera(camera: Camera, width: int, height: int) -> Camera:
     return Camera(camera.viewmat, camera.K * factors, width, height, rays)
 
 
+def halved_camera(camera: Camera) -> Camera:
+    """Return the same view at half the width and height, without a last odd row or column of pixels."""
+    width = camera.width // 2
+    height = camera.height // 2
+    rays = None if camera.rays is None else camera.rays[: 2 * height, : 2 * width]
+    return resize_camera(Camera(camera.viewmat, camera.K, 2 * width, 2 * height, rays), width, height)
+
+
 def _resampled(values: Array, num: int, axis: int) -> Array:
     """Return values at the centres of `num` pixels along an axis, linear between and beyond the old centres."""
     num_old = values.shape[axis]

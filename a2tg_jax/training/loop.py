@@ -18,7 +18,7 @@ import numpy as np
 from a2tg_jax.base.even_spacing import evenly_chosen
 from a2tg_jax.base.machine import Devices
 from a2tg_jax.base.text import in_bytes
-from a2tg_jax.core.cameras import resize_camera
+from a2tg_jax.core.cameras import halved_camera
 from a2tg_jax.core.compilations import compilations
 from a2tg_jax.core.table import Layout
 from a2tg_jax.events import Due, HostEvent, StepEvent
@@ -445,10 +445,9 @@ class StageRun:
         if drawn not in self.capacities:
             dtype = model.gaussians.means.dtype
             appearance = model.appearance
-            height, width = drawn
             views = [view for view in self.views if view.picture.size == size]
             sample = evenly_chosen(views, PLANNED_VIEWS)
-            cameras = [view.camera if not is_halved else resize_camera(view.camera, width, height) for view in sample]
+            cameras = [halved_camera(view.camera) if is_halved else view.camera for view in sample]
             cameras = [jax.tree.map(lambda x: jnp.asarray(x, dtype), camera) for camera in cameras]
             pairs = most_pairs(model.gaussians, cameras, appearance, settings, model.num_live)
             growth = (model.num_rows / max(model.num, 1)) ** 0.5
