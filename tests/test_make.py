@@ -15,6 +15,7 @@ import a2tg_jax as a2tg
 from a2tg_jax.cli import main as cli, make
 from a2tg_jax.host.signals import Stopped
 from a2tg_jax.results.folder import RunFolder
+from a2tg_jax.results.images import save_picture
 from a2tg_jax.results.minutes import Speed, TimedTraining, measured_speed, training_within
 from a2tg_jax.results.record import read_record
 
@@ -164,8 +165,14 @@ def test_photographs_that_changed_since_the_scene_was_made_are_noticed(tmp_path,
     monkeypatch.setattr("a2tg_jax.results.minutes.choose_training", raising(ValueError(reached)))
     (photos / "notes.txt").write_text("longer")
     (photos / "@eaDir/1.jpg").touch()
+    (photos / "masks/room").mkdir(parents=True)
+    (photos / "masks/room/2.JPG.png").write_bytes(b"1234")
+    (photos / "1_mask.png").touch()
+    save_picture(photos / "cameras.png", np.zeros((4, 4, 3), np.uint8))
     is_answered(capsys, words, reached)
-    is_answered(capsys, [tmp_path / "miku", "--out", "out"], reached)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for same in (tmp_path / "miku", "~/miku"):
+        is_answered(capsys, [same, "--out", "out"], reached)
     is_answered(
         capsys, [*(photos / name for name in ("0.jpg", "1.jpg")), photos / "room", "--out", "out"], "1 new (room/2.JPG)"
     )

@@ -12,7 +12,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from a2tg_jax.base.json_text import read_object
-from a2tg_jax.base.regular_files import is_regular
+from a2tg_jax.base.regular_files import expanded, is_regular
 from a2tg_jax.base.text import first_names
 from a2tg_jax.cli.arguments import defaulting_to, open_browser, print_now
 from a2tg_jax.cli.main import parsed
@@ -63,10 +63,11 @@ class Make:
             raise ValueError("PHOTOS is missing: a folder of photographs, photographs, a video, or a scene folder")
         check_number("minutes", self.minutes, above=0)
         started = time.monotonic()
-        first = self.sources[0]
+        sources = list(map(expanded, self.sources))
+        first = sources[0]
         name = first.resolve().stem if first.suffix else first.resolve().name
         out = self.out or Path("runs") / name
-        for source in self.sources:
+        for source in sources:
             if not source.exists():
                 raise FileNotFoundError(f"{source}: no such file or folder")
             check_apart(out, source)
@@ -81,15 +82,15 @@ class Make:
         for path in (page, picture, flight):
             if is_new and path.exists():
                 raise FileExistsError(f"{path} exists, and was made from no run in {out}: choose another `out`")
-        has_cameras = len(self.sources) == 1 and is_scene(first)
+        has_cameras = len(sources) == 1 and is_scene(first)
         scene = first if has_cameras else out / "scene"
-        photographs = photograph_sizes(self.sources)
+        photographs = photograph_sizes(sources)
         if not is_new or (not has_cameras and is_scene(scene)):
             check_unchanged(photographs, out)
         else:
             write_json(out / LISTED, photographs)
         if not is_scene(scene):
-            run_step("sfm", [*map(str, self.sources), "--out", str(scene)])
+            run_step("sfm", [*map(str, sources), "--out", str(scene)])
         if is_new:
             left = 60 * self.minutes - (time.monotonic() - started)
             training = choose_training(scene, left)

@@ -12,7 +12,7 @@ import warnings
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
-from pathlib import Path, PurePath, PurePosixPath
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
@@ -95,12 +95,14 @@ def holds_photos(folder: Path) -> bool:
 
 
 def listed_photos(folder: Path) -> list[Path]:
-    """Return the files in a folder and below it with suffixes of photographs, sorted, without hidden ones.
+    """Return the photographs in a folder and below it, sorted, with damaged ones.
 
-    `find_photos` leaves out more, such as copies, which it has to read.
+    Unlike `find_photos`, with copies of others, which take long to find, and in any number.
     """
-    photos = (file for file in _files_below(folder) if file.suffix.lower() in PHOTO_SUFFIXES)
-    return sorted(photo for photo in photos if not _is_hidden(photo.relative_to(folder)))
+    files = sorted(file for file in _files_below(folder) if file.suffix.lower() in PHOTO_SUFFIXES)
+    pictures = {file.relative_to(folder).as_posix(): file for file in files}
+    others = set().union(*_no_photographs(folder, list(pictures)).values())
+    return [file for name, file in pictures.items() if name not in others]
 
 
 def find_photos(folder: Path, least: int = LEAST_PHOTOS, chosen: Sequence[Path] | None = None) -> list[str]:
@@ -155,15 +157,22 @@ def find_photos(folder: Path, least: int = LEAST_PHOTOS, chosen: Sequence[Path] 
 
 
 def _left_out(folder: Path, pictures: Sequence[str]) -> dict[str, set[str]]:
-    """Return the pictures that are no photographs by what they are, without kinds of which there are none."""
-    left_out = {
-        OWN: _written(folder, pictures),
-        "in hidden folders": {name for name in pictures if _is_hidden(PurePosixPath(name))},
-        "masks or depth maps": _masks(pictures),
-    }
+    """Return the pictures that are left out by the reason, without reasons that apply to none."""
+    left_out = _no_photographs(folder, pictures)
     others = set().union(*left_out.values())
     left_out["copies of others"] = _copies(folder, [name for name in pictures if name not in others])
     return {kind: names for kind, names in left_out.items() if names}
+
+
+def _no_photographs(folder: Path, pictures: Sequence[str]) -> dict[str, set[str]]:
+    """Return the pictures that are no photographs by what they are."""
+    # Such as @eaDir, Synology's folder of thumbnails.
+    hidden = {name for name in pictures if any(part[0] in ".@" for part in name.split("/")[:-1])}
+    return {
+        OWN: _written(folder, pictures),
+        "in hidden folders": hidden,
+        "masks or depth maps": _masks(pictures),
+    }
 
 
 def _about_left_out(left_out: Mapping[str, set[str]]) -> str:
@@ -175,11 +184,6 @@ def _about_left_out(left_out: Mapping[str, set[str]]) -> str:
 def _files_below(folder: Path) -> Iterator[Path]:
     # macOS puts ._0.jpg, which is no picture, next to 0.jpg on disks of other systems.
     return (file for file in folder.rglob("*") if file.name[0] != "." and file.is_file())
-
-
-def _is_hidden(path: PurePath) -> bool:
-    """Return whether a relative path is in a hidden folder, or one such as @eaDir, Synology's folder of thumbnails."""
-    return any(part[0] in ".@" for part in path.parts[:-1])
 
 
 def _skipped(folder: Path, files: list[Path]) -> str:
