@@ -12,6 +12,7 @@ import a2tg_jax as a2tg
 from a2tg_jax.scene import View
 from a2tg_jax.training import loop
 from a2tg_jax.training.batches import Photographs, over_background
+from a2tg_jax.training.cost import forecast_stages
 from a2tg_jax.training.start import initial_model
 
 SMALL = a2tg.synthetic_scene(num_views=4, width=24, height=18, num_points=80)
@@ -91,6 +92,21 @@ def test_small_photographs_stay_whole():
     scene = doubled(SMALL)
     wanted = first_stage(scene, SYSTEM)
     assert bits_of(first_stage(scene, dataclasses.replace(SYSTEM, coarse_share=1.0))) == bits_of(wanted)
+
+
+@pytest.mark.usefixtures("small_ones_are_halved")
+def test_both_programs_are_compiled_at_the_first_step_and_counted():
+    """The mean time of a compilation is wrong otherwise, by which later ones are forecast."""
+    scene = doubled(SMALL)
+    # A number of rows that no other test has, because the programs of others are in JAX's cache.
+    system = dataclasses.replace(SYSTEM, coarse_share=0.25, densify=a2tg.CloneSplitPrune(cap=470))
+    run = loop.StageRun(scene, system, 0, initial_model(scene, system))
+    run.steps(1, 1)
+    assert run.effects.num_compiled == 2
+    run.steps(2, 8)
+    assert run.effects.num_compiled == 2
+    whole = next(forecast_stages(scene, dataclasses.replace(system, coarse_share=0.0)))
+    assert next(forecast_stages(scene, system)).num_programs == whole.num_programs + 1
 
 
 @pytest.mark.usefixtures("small_ones_are_halved")

@@ -150,10 +150,10 @@ def test_programs_are_counted_before_and_while_it_trains(scene):
     arguments = state.model, state.moments, ()
     for how, ahead in (("rows", 0), ("moments", 38)):
         effects = StageEffects(stage, system, num_sizes=1)
-        effects.launch(1, 10.0)
+        effects.launch(1, 2, 20.0)
         assert effects.programs_ahead(1) == effects.programs_ahead(4) == 39
         effects.apply(0, state, PruneFaint(how).apply(a2tg.Due(), *arguments))
-        effects.launch(5, None if how == "rows" else 14.0)
+        effects.launch(5, 0 if how == "rows" else 1, 16.0)
         assert effects.programs_ahead(5) == ahead
     assert effects.seconds_a_program == 12.0
     assert StageEffects(stage, system, num_sizes=3).programs_ahead(1) == 3 * 39

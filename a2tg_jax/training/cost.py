@@ -79,7 +79,9 @@ def forecast_stages(
             model_bytes = event.most_bytes(model_bytes, num, stage.iterations)
         floats = (model_bytes - shared) / BYTES_PER_FLOAT / num - own_floats
         on_host = [event for event in stage.events if isinstance(event, HostEvent)]
-        num_programs = 1 + sum(event.num_programs(stage.iterations) for event in on_host)
+        # One for halved photographs, and one for whole ones.
+        num_programs = 2 if stage.num_coarse else 1
+        num_programs += sum(event.num_programs(stage.iterations) for event in on_host)
         # An event has the old state and the new one; later, the devices get their shares.
         is_changed = any(event.times(stage.iterations) for event in on_host)
         whole = STATES * (2 if is_changed else 1 + 1 / num_devices) * model_bytes

@@ -399,7 +399,8 @@ class StageRun:
         with compilations() as phases:
             try:
                 if self.memory is None:
-                    # The call that follows finds this program, in JAX's cache of this process.
+                    # A call finds this program in JAX's cache of this process: the one that follows, or the first with
+                    # whole photographs.
                     step = jitted_step().lower(*largest).compile()
                     model_bytes = sum(leaf.nbytes for leaf in jax.tree.leaves(self.state.model))
                     self.memory = check_step_fits(
@@ -408,9 +409,9 @@ class StageRun:
                 self.state, info = jitted_step()(*arguments)
             except ValueError as error:  # The step is not compiled for the name of its stage.
                 raise ValueError(f"stage {self.stage.name!r}: {error}") from error
-        is_compiled = any(phase.makes_code for phase in phases)
-        self.effects.launch(iteration, time.perf_counter() - started if is_compiled else None)
-        if is_compiled:
+        num_compiled = sum(phase.makes_code for phase in phases)
+        self.effects.launch(iteration, num_compiled, time.perf_counter() - started)
+        if num_compiled:
             self.session.after_compiling()
         return info
 

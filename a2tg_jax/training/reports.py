@@ -280,14 +280,14 @@ class StageEffects:
             effects.unused = change.unused
         effects.num_applied += 1
 
-    def launch(self, iteration: int, seconds: float | None) -> None:
-        """Record a step that was launched, and the seconds that its compilation took, if any. Warn if an event is why
-        steps are compiled again and again."""
+    def launch(self, iteration: int, num_compiled: int, seconds: float) -> None:
+        """Record a step that was launched, the number of programs that were compiled for it, and the seconds that this
+        took. Warn if an event is why steps are compiled again and again."""
         reshaped_by = self._reshaped_by
         self._reshaped_by = []
-        if seconds is None:
+        if num_compiled == 0:
             return
-        self.num_compiled += 1
+        self.num_compiled += num_compiled
         self._seconds += seconds
         for place in dict.fromkeys(reshaped_by):
             event, times, effects = self._on_host[place]
