@@ -159,13 +159,15 @@ def test_forward_mode_goes_through_groups(monkeypatch):
     assert_all_close(found, tuple(jnp.stack(each) for each in zip(*wanted, strict=True)), 2e-5, 2e-5)
 
 
-def test_sizes_of_groups(threads):
+@pytest.mark.usefixtures("threads")
+def test_sizes_of_groups():
     set_num_threads(2)
     sizes = {(64, 10_000): 8, (6, 10_000): 6, (64, 100): 64, (10, 30_000): 2, (7, 20_000): 4, (9, 10**6): 1}
     assert {views: view_groups.group_size(*views) for views in sizes} == sizes
 
 
-def test_a_call_of_a_batch_has_every_member_once(threads):
+@pytest.mark.usefixtures("threads")
+def test_a_call_of_a_batch_has_every_member_once():
     """Shared arrays have length 1; nested batches have several axes; a member has one thread if there are enough."""
     threads = []
 
@@ -192,7 +194,8 @@ def test_a_call_of_a_batch_has_every_member_once(threads):
     assert none[0].shape == (0, 3) and len(threads) == 2
 
 
-def test_an_error_in_a_batch_reaches_the_caller(threads):
+@pytest.mark.usefixtures("threads")
+def test_an_error_in_a_batch_reaches_the_caller():
     def handler(arguments, results):
         results[0][...] = arguments[0]
         if arguments[0][0] == 2:

@@ -110,7 +110,7 @@ def _lists_on(platform: str, compositor: CompositorChoice, near_plane: float, gr
 def _forward(settings: PassSettings, inputs: PassInputs, jacobian: Array, probe: Array) -> tuple[Array, Array]:
     """Return channels [tiles, D, P] and transmittance [tiles, P]; jacobian and probe are for the backward pass.
 
-    The statistic is as well: without it, the kernel is the same in training and afterwards.
+    So is the statistic: without it, training and later renders have one kernel.
     """
     tiles = settings.grid.num
     shapes = (tiles, settings.num_channels, settings.num_pixels), (tiles, settings.num_pixels)

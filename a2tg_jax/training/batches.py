@@ -39,9 +39,9 @@ class Photographs(NamedTuple):
     Ks: Array
     """[V, 3, 3]."""
     images: Array
-    """[V, H, W, 3] uint8."""
+    """[V, H, W, 3] uint8; floats from 0 to 255 once they are halved."""
     alphas: Array | None
-    """[V, H, W] uint8, or None if the images are opaque."""
+    """[V, H, W] as the images, or None if they are opaque."""
     masks: Array | None = None
     """[V, H, W] bool, True at pixels that count; None if all do."""
     depths: Array | None = None
@@ -92,8 +92,8 @@ class Photographs(NamedTuple):
 
 
 def over_background(image: Array, alpha: Array | None, background: Array) -> Array:
-    """Return a photograph [H, W, 3] uint8 with its opacity [H, W] uint8 over a colour [3]: floats in [0, 1], of the
-    colour's dtype; traced."""
+    """Return a photograph [H, W, 3] with its opacity [H, W], both from 0 to 255, over a colour [3]: floats in [0, 1],
+    of the colour's dtype; traced."""
     photograph = image.astype(background.dtype) / 255
     if alpha is None:
         return photograph
