@@ -154,6 +154,45 @@ def test_an_appearance_without_translation_is_left_to_xla():
         show(compositor="native")
 
 
+@jax.custom_jvp
+def gaussian(rho):
+    return jnp.exp(-0.5 * rho)
+
+
+@gaussian.defjvp
+def gaussian_jvp(primals, tangents):
+    value = gaussian(*primals)
+    return value, (-0.5 * value + 0 * jax.lax.digamma(1 + primals[0])) * tangents[0]
+
+
+@pytree
+class UntranslatableGradient(Appearance):
+    def falloff(self, numbers, rho):
+        return gaussian(rho)
+
+
+def test_a_gradient_alone_without_translation_is_left_to_xla():
+    """Native loops draw the image, as that of the plain appearance with the same falloff."""
+    scene = draw_scene(9, num=8, width=16, height=16)
+    gaussians = as_gaussians(scene, "float32")
+    camera = as_camera(scene, "float32")
+
+    def loss(gaussians, appearance, compositor):
+        settings = RenderSettings(compositor=compositor, capacity=512)
+        color = render_appearance(gaussians, camera, appearance, settings=settings).color
+        return jnp.sum(color**2), color
+
+    differentiate = jax.grad(loss, has_aux=True)
+    with pytest.warns(UserWarning, match=r"UntranslatableGradient is composited by XLA.*'digamma' in the gradient of"):
+        found, image = differentiate(gaussians, UntranslatableGradient(), "auto")
+    np.testing.assert_array_equal(image, loss(gaussians, UntranslatableGradient(), "native")[1])
+    wanted, expected = differentiate(gaussians, Appearance(), "xla")
+    np.testing.assert_allclose(image, expected, atol=1e-5)
+    assert_all_close(found, wanted, 1e-4, 1e-5)
+    with pytest.raises(ValueError, match=r"compositor='native' cannot run UntranslatableGradient.*'digamma'"):
+        differentiate(gaussians, UntranslatableGradient(), "native")
+
+
 OPTIONS = TextureOptions("align-corners", "identity", "unit")
 
 

@@ -258,6 +258,10 @@ def test_a_mask_as_background_is_an_alpha_channel(tmp_path, model, room):
 
 def test_a_mask_as_background_has_one_meaning(tmp_path):
     write_scene(tmp_path)
+    with pytest.warns(
+        UserWarning, match="no photograph has a mask, so that `mask_as` background changes nothing; masks"
+    ):
+        load_scene(tmp_path, mask_as="background")
     with pytest.raises(ValueError, match="`alpha` must be transparency where `mask_as` is background"):
         load_scene(tmp_path, alpha="mask", mask_as="background")
     with pytest.raises(ValueError, match="mask_as must be one of ignored, background; got 'cut'"):

@@ -159,6 +159,12 @@ def read_photos(
     lacking = [each.photo.name for each in files if each.mask is None]
     if not masks:
         _warn_of_unused_masks(photos)
+        if options.mask_as == "background":
+            warnings.warn(
+                f"{place}: no photograph has a mask, so that `mask_as` background changes nothing; masks are read "
+                f"from the folder {MASKS} next to images, or from the mask_path of a frame of transforms.json",
+                stacklevel=3,
+            )
     else:
         warn_of_lacking_masks(place, lacking, len(files))
     warn_of_grey([grey for _, grey in read if grey is not None], masks)

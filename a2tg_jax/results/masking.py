@@ -1,6 +1,7 @@
 """Masks of a run's photographs: where they show its subject, or what an edit keeps."""
 
 import dataclasses
+import warnings
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -54,7 +55,10 @@ def write_masks(
     subject = find_subject(model) if chosen.subject else None
     is_kept = kept_by(model, chosen, subject)
     # Photographs as the files are: training undistorts and downscales masks as it does photographs.
-    photographs = SceneSource(record.scene.path, test_every=0, mask_as="background", lens="keep").load()
+    with warnings.catch_warnings():
+        # Earlier masks may be missing, or black, which is an error where they are not the background.
+        warnings.filterwarnings("ignore", ".*no photograph has a mask", UserWarning)
+        photographs = SceneSource(record.scene.path, test_every=0, mask_as="background", lens="keep").load()
     viewmats = {} if model.origin is None else dict(zip(model.origin.names, model.origin.viewmats, strict=True))
     views = [view for view in (*photographs.train, *photographs.test) if view.name in viewmats]
     if not views:
