@@ -65,8 +65,8 @@ class Photographs(NamedTuple):
     def halved(self) -> "Photographs":
         """Return the views at half the width and height, in floats; traced.
 
-        A pixel is the mean of four, weighed by their opacities; it counts, and has a depth, if all four do. A last odd
-        row or column is left out.
+        A pixel is the mean of four, weighed by their opacities; it counts if all four do, and has the depth of the
+        first, because a mean at an edge is no surface's. A last odd row or column is left out.
         """
         height, width = (side // 2 for side in self.images.shape[1:3])
         dtype = self.Ks.dtype
@@ -85,7 +85,7 @@ class Photographs(NamedTuple):
             weights = self.alphas.astype(dtype)[..., None]
             images = means(weights * self.images.astype(dtype)) / jnp.maximum(alphas, np.finfo(dtype).tiny)[..., None]
         masks = None if self.masks is None else jnp.all(fours(self.masks), axis=(2, 4))
-        depths = None if self.depths is None else means(self.depths)
+        depths = None if self.depths is None else fours(self.depths)[:, :, 0, :, 0]
         rays = None if self.rays is None else means(self.rays[None])[0] / 2
         Ks = self.Ks * jnp.asarray([[[0.5], [0.5], [1.0]]], dtype)
         return Photographs(self.viewmats, Ks, images, alphas, masks, depths, rays)
