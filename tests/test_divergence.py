@@ -1,6 +1,7 @@
 """Numbers that are not finite and losses that explode: found, named and undone; stops at the ends of a stage."""
 
 import dataclasses
+import pickle
 import signal
 
 import jax
@@ -87,6 +88,9 @@ def test_what_is_not_finite_is_named_and_the_state_before_is_kept(scene, tmp_pat
     save_checkpoint(tmp_path / "kept.npz", raised.value.checkpoint)
     kept = load_checkpoint(tmp_path / "kept.npz", WithEvent)
     assert kept.iteration == 11 and np.isfinite(kept.model.gaussians.log_scales).all()
+    # From another process, as of a sweep.
+    sent = pickle.loads(pickle.dumps(raised.value))
+    assert str(sent) == text and sent.checkpoint.iteration == 11
 
 
 def test_tables_without_rows_are_finite():

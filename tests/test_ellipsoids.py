@@ -89,3 +89,23 @@ def test_a_short_training_fills_its_budget_and_learns():
     assert result.model.appearance.log_thickness.shape == (150,)
     history = result.stages[0].history.psnr
     assert history[-4:].mean() > history[:4].mean() + 1
+
+
+def test_long_splats_close_to_the_camera_have_finite_gradients():
+    """Their covariance is nearly singular: 0.3 pixels² beside 10⁸. In float32 a difference of squares would cancel."""
+    camera = a2tg.Camera(jnp.eye(4), jnp.asarray([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]]), 320, 240)
+    quats = jnp.asarray(np.random.default_rng(0).normal(size=(50, 4)), jnp.float32)
+    means = jnp.tile(jnp.asarray([[0.02, -0.01, 0.05]]), (50, 1))
+    log_scales = jnp.tile(jnp.asarray([[-9.0, -9.0]]), (50, 1))
+    gaussians = a2tg.Gaussians(means, quats, log_scales, jnp.zeros(50), jnp.zeros((50, 1, 3)))
+
+    def homographies(gaussians, thickness):
+        return Ellipsoids(log_thickness=thickness).homographies(gaussians, camera)[0]
+
+    M, back = jax.vjp(homographies, gaussians, jnp.full(50, 0.4))
+    gradients = back(jnp.ones_like(M))
+    assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(gradients))
+    # The shorter axis on the screen is at least that of the low-pass filter.
+    across = np.linalg.det(np.asarray(M[:, :2, :2], np.float64)) / 0.05**2
+    along = np.linalg.norm(np.asarray(M[:, :2, :2], np.float64), 2, axis=(1, 2)) / 0.05
+    assert (across / along).min() > 0.9 * np.sqrt(0.3)

@@ -23,6 +23,9 @@ class DivergedError(ValueError):
         super().__init__(message)
         self.checkpoint = checkpoint
 
+    def __reduce__(self) -> tuple[object, ...]:
+        return type(self), (str(self), self.checkpoint)  # by default, pickle calls __init__ with the message alone
+
 
 def largest_loss(history: History) -> float:
     """Return the largest loss that a stage may have; infinite before the first logged iteration."""

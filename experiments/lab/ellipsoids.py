@@ -50,10 +50,13 @@ class Ellipsoids(a2tg.Appearance):
         at_border = MOST_TANGENT * jnp.array([0.5 * camera.width, 0.5 * camera.height], z.dtype) / jnp.diagonal(K)[:2]
         tangents = [jnp.clip(w / z, -most, most) for w, most in ((x, at_border[0]), (y, at_border[1]))]
         rows = [(in_camera[:, i] - tangents[i][:, None] * in_camera[:, 2]) * (K[i, i] / z)[:, None] for i in range(2)]
-        xx, yy = (jnp.sum(row * row, axis=1) + LOW_PASS for row in rows)
+        squares = [jnp.sum(row * row, axis=1) for row in rows]
         xy = jnp.sum(rows[0] * rows[1], axis=1)
-        along = jnp.sqrt(xx)
-        across = jnp.sqrt(yy - (xy / along) ** 2)
+        normal = jnp.cross(*rows)
+        along = jnp.sqrt(squares[0] + LOW_PASS)
+        # The root of the determinant, a sum of squares: yy − xy²/xx would cancel for long splats, to 0 or less.
+        determinant = jnp.sum(normal * normal, axis=1) + LOW_PASS * (squares[0] + squares[1] + LOW_PASS)
+        across = jnp.sqrt(determinant) / along
         none = jnp.zeros_like(z)
         M = [z * along, none, K[0, 0] * x + K[0, 2] * z, z * (xy / along), z * across, K[1, 1] * y + K[1, 2] * z]
         return jnp.stack([*M, none, none, z], axis=1).reshape(-1, 3, 3), normals
