@@ -10,7 +10,7 @@ from a2tg_jax.base.regular_files import check_exists, expanded
 T = TypeVar("T")
 VERSION = 1
 WRITERS = {"path": "the viewer's 'Save path'", "edit": "a2tg edit or the viewer's 'Save edit'"}
-"""What makes a file of each kind."""
+"""Programs that write each kind of file, in words."""
 
 
 def load_saved(path: Path, kind: str, parse: Callable[[dict[str, Any]], T]) -> T:
