@@ -148,6 +148,7 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     expect([await page.isDisabled("#undo"), await page.isDisabled("#alone")]).toEqual([true, true]);
     await page.click("#cropping > summary");
     const handle = page.locator('#box circle[aria-label="Width, from, of the box"]');
+    await handle.waitFor({ state: "visible" });
     await handle.focus();
     await page.keyboard.press("ArrowRight");
     expect(Number(await page.inputValue("#from-width"))).toBeCloseTo(0.01, 9);
