@@ -1,4 +1,4 @@
-"""Choose the best plain method of each scene on validation views: --scale claims --validation (PROTOCOL.md)."""
+"""Choose the strongest plain method of each scene on validation views: --scale claims --validation (PROTOCOL.md)."""
 
 from collections.abc import Sequence
 
@@ -10,8 +10,8 @@ from lab.grid_file import GRIDS
 
 from a2tg_jax.results.folder import write_json
 
-FILES = {"protocol": GRIDS / "best_plain.json", "claims": GRIDS / "strongest_plain.json"}
-"""The choices by scene, which grids read (`chosen_in`), by scale."""
+CHOICES = GRIDS / "strongest_plain.json"
+"""The choices by scene, which grids read (`chosen_in`)."""
 
 
 def best_methods(results: Sequence[tables.Result], num_methods: int) -> dict[str, str]:
@@ -32,8 +32,8 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     best = best_methods(results, 1 + len(grid.methods))
     chosen = tables.markdown(["scene", "chosen"], [[scene, label] for scene, label in best.items()])
     lab.write(EXPERIMENT.name, f"# {grid.title}\n\n{chosen}\n{tables.choices_table(results, grid.reference.label)}")
-    if lab.scale in FILES and lab.args.validation and not lab.is_partial:
-        write_json(FILES[lab.scale], best)
+    if lab.scale == "claims" and lab.args.validation and not lab.is_partial:
+        write_json(CHOICES, best)
 
 
 EXPERIMENT = Experiment("choose_plain", ("choose_plain",), present, __doc__)

@@ -1,7 +1,8 @@
-"""The tables and the chart of docs/results.md, and the comparisons in NOTEBOOK.md that this page leaves out."""
+"""The tables of the paper's claim on docs/results.md, their chart, and comparisons that are in NOTEBOOK.md alone."""
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -10,8 +11,9 @@ from lab.cli import Experiment, Lab
 from lab.grid import Grid, read_grid
 from lab.jobs import Record
 from lab.kept import read_kept
-from lab.statistics import Comparison, bootstrap, compare, differences, holm
-from lab.tables import EQUAL_BYTES, EQUAL_TIME, Result
+from lab.statistics import Comparison, bootstrap, compare, differences
+from lab.tables import EQUAL_BYTES, Result
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from a2tg_jax.results.figures import save_figure
@@ -39,46 +41,11 @@ QUICK = "in `quick`"
 """Name of E1's place in the table."""
 QUICK_SIZE = 60
 """Its bytes per pixel; other sizes are in NOTEBOOK.md."""
-DENSE = "dense"
-FEW = "few views"
-BEST = "Best plain method"
+DEGREE_COLORS = {3: "#4477aa", 0: "#cc3311"}
+PANELS_IN_ROW = 3
 MCMC = "2DGS*-MCMC"
 TEXTURED = "Textured Gaussians*"
 BYTEWISE = "Bytewise"
-SECOND = "Bytewise, second version"
-FIRST = "Bytewise, first version"
-VERSIONS = {BYTEWISE: "bytewise", SECOND: "bytewise 2", FIRST: "bytewise 1"}
-"""Names in the table of `bytewise` and of its earlier versions: the second places no Gaussians by errors of pictures,
-and the first has textures and no weight on opacities either."""
-PRIMARY = f"{VERSIONS[FIRST]} − best plain method, 0.3 MB"
-REGISTERED = ", the registered endpoint"
-SECONDARY = {
-    "equal time": (PRIMARY + EQUAL_TIME, "psnr"),
-    "SSIM": (PRIMARY, "ssim"),
-    "LPIPS": (PRIMARY, "lpips"),
-    "1.2 MB": (f"{VERSIONS[FIRST]} − best plain method, 1.2 MB", "psnr"),
-}
-"""Secondary endpoints: row of the table and figure."""
-CHOSEN_ON = {"fox", "lego", "snowmiku"}
-"""Scenes on which defaults of `bytewise` were chosen."""
-UNSEEN = ", without fox, lego and snowmiku"
-OTHERS = {
-    BEST: "best plain method",
-    BEST + EQUAL_TIME: "best plain method",
-    "3DGS-MCMC, degree 0": "3DGS, degree 0",
-    "3DGS-MCMC, degree 3": "3DGS, degree 3",
-    SECOND: VERSIONS[SECOND],
-    FIRST: VERSIONS[FIRST],
-}
-"""Methods that `bytewise` is compared with, in the words of the table."""
-PARTS = {
-    "Bytewise without shapes": "shapes of kernels",
-    "Bytewise without pruning": "pruning",
-    "Bytewise without splitting": "splitting",
-    "Bytewise, degree 0": "view dependence and textures",
-    "Bytewise without textures": "textures",
-}
-"""What `bytewise` has that a variant lacks."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,43 +85,6 @@ class Row:
         """Return the interval of PSNR by the bootstrap for a table, a dash for less than two scenes."""
         low, high = bootstrap(self.differences("psnr"))
         return tables.MISSING if np.isnan(low) else f"{low:+.2f} to {high:+.2f}"
-
-
-def rows_of_bytewise(results: Sequence[Result], in_equal_time: Sequence[Result]) -> list[Row]:
-    """Return the comparisons of `bytewise`, by stratum and budget. At equal iterations, all runs count. At equal time,
-    plain methods in `results` trained for as long as the first version, and in `in_equal_time` for as long as the
-    present one."""
-    rows = []
-    order = list(VERSIONS)
-    for stratum in (DENSE, FEW):
-        for budget in (0.3, 1.2):
-            own, timed = (
-                [result for result in each if stratum_of(result) == stratum and result.run.cell.budget == budget]
-                for each in (results, in_equal_time)
-            )
-            trained_for = {FIRST: own, BYTEWISE: timed}
-            for (version, prefix), (label, wording) in itertools.product(VERSIONS.items(), OTHERS.items()):
-                if label in VERSIONS and order.index(label) <= order.index(version):
-                    continue  # Versions are compared with earlier ones.
-                is_timed = label.endswith(EQUAL_TIME)
-                place = f"{budget:g} MB" + ("" if stratum == DENSE else f", {FEW}") + (EQUAL_TIME if is_timed else "")
-                found = trained_for.get(version, []) if is_timed else own + timed
-                rows.append(Row(f"{prefix} − {wording}, {place}", found, version, label))
-                if version == FIRST and label == BEST and stratum == DENSE:
-                    others = [result for result in own if result.run.cell.scene.label not in CHOSEN_ON]
-                    rows.append(Row(rows[-1].name + UNSEEN, others, version, label))
-    return rows
-
-
-def stratum_of(result: Result) -> str:
-    return DENSE if result.run.cell.scene.fold is None else FEW
-
-
-def rows_of_parts(results: Sequence[Result]) -> list[Row]:
-    """Return what each part of the first version of `bytewise` brings, and shapes of kernels to plain Gaussians."""
-    rows = [Row(f"{VERSIONS[FIRST]}: {part}, 0.3 MB", results, FIRST, label) for label, part in PARTS.items()]
-    pruned = f"{MCMC}, degree 0, pruned"
-    return [*rows, Row("plain, pruned: shapes of kernels, 0.3 MB", results, f"{pruned}, with shapes", pruned)]
 
 
 def rows_against(
@@ -203,7 +133,7 @@ def rows_at_length(grid: Grid, degree: int, records: Mapping[str, Record], place
             zero = suffixed(MCMC, 0) + EQUAL_BYTES
             name = f"{A2TG} − plain of degree 0"
             rows.append(dataclasses.replace(rows[-1], name=name, label=grid.reference.label, other=zero))
-        name = f"{VERSIONS[BYTEWISE]} − {A2TG}"
+        name = f"`bytewise` − {A2TG}"
         rows.append(dataclasses.replace(rows[-1], name=name, label=BYTEWISE + EQUAL_BYTES, other=grid.reference.label))
     return rows
 
@@ -297,45 +227,19 @@ def emphasized(text: str, found: Comparison) -> str:
     return f"**{text}**" if found.is_decided else text
 
 
-def endpoints(rows: Sequence[Row]) -> str:
-    """Return the secondary endpoints with corrected p-values."""
-    by_name = {row.name: row for row in rows}
-    found = {name: by_name[row].compared(figure) for name, (row, figure) in SECONDARY.items()}
-    corrected = holm({name: one.p_value for name, one in found.items() if one.by_scene})
-    lines = [
-        [name, with_interval(found[name], SECONDARY[name][1]), tables.number(p_value, 3)]
-        for name, p_value in corrected.items()
-    ]
-    return tables.markdown(["secondary endpoint", "mean over scenes", "p, Holm"], lines)
-
-
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
     """Write the tables and the chart, from the records of this scale and of the other scales."""
-    bytewise, equal_time, parts = (tables.results_of(grid, lab.records) for grid in grids)
-    of_bytewise = rows_of_bytewise(bytewise, equal_time)
     of_a2tg = rows_of_a2tg(lab)
     shown = [row for row in of_a2tg if row.is_on_page]
     others = [row for row in of_a2tg if not row.is_on_page]
     lab.write("paper", f"# The paper's comparison\n\n{short_table(shown)}", has_old_rows=False)
     lab.write("matched_degree", f"# Other comparisons of A²TG\n\n{table_of(others)}", has_old_rows=False)
-
-    own = shown_of_bytewise(of_bytewise)
-    earlier = [row for row in of_bytewise if row not in own]
-    lab.write(EXPERIMENT.name, f"# Findings\n\n{short_table(own)}")
-    lab.write("parts_of_bytewise", f"# Parts of bytewise 1\n\n{table_of(rows_of_parts(parts))}")
-    lab.write("earlier_versions", f"# Earlier versions of bytewise\n\n{table_of(earlier)}\n{endpoints(of_bytewise)}")
-
     at_length = [row for row in shown if row.place.startswith(PLACES["paper160"])]
-    dense = [row for row in own if row.name.endswith(("0.3 MB", EQUAL_TIME))]
-    by_scene = [scenes_table(rows) for rows in (at_length, dense) if any(row.differences("psnr") for row in rows)]
-    lab.write("details", "\n".join(["# Details of the findings\n", table_of([*shown, *own]), *by_scene]))
-    # Differences from 3DGS of degree 3 are several times as large as the others.
-    charted = {A2TG: shown, VERSIONS[BYTEWISE]: [row for row in own if row.other != "3DGS-MCMC, degree 3"]}
-    found = {
-        title: [row for row in rows if len(row.differences("psnr")) >= LEAST_SCENES] for title, rows in charted.items()
-    }
-    if all(found.values()):
-        save_figure(lab.pages / f"{EXPERIMENT.name}.png", forest(found))
+    by_scene = scenes_table(at_length) if any(row.differences("psnr") for row in at_length) else ""
+    lab.write(EXPERIMENT.name, f"# Findings\n\n{table_of(shown)}\n{by_scene}", has_old_rows=False)
+    results = [result for grid in grids for result in tables.results_of(grid, lab.records)]
+    if results:
+        save_figure(lab.pages / "psnr_by_bytes.png", psnr_by_bytes(results))
 
 
 def rows_of_a2tg(lab: Lab) -> list[Row]:
@@ -354,42 +258,41 @@ def rows_of_a2tg(lab: Lab) -> list[Row]:
     return rows
 
 
-def shown_of_bytewise(rows: Sequence[Row]) -> list[Row]:
-    """Return the present comparisons with the best plain method and with 3DGS, and the registered one."""
-    found = []
-    for row in rows:
-        is_plain = row.other.startswith(BEST)
-        is_3dgs = row.other.startswith("3DGS") and FEW not in row.name
-        if row.label == BYTEWISE and (is_plain or is_3dgs):
-            found.append(row)
-    registered = [dataclasses.replace(row, name=row.name + REGISTERED) for row in rows if row.name == PRIMARY]
-    return [*found, *registered]
-
-
-def forest(found: Mapping[str, Sequence[Row]]) -> Figure:
-    """Return a panel for each group of comparisons with a row for each: the values of its scenes, and their mean with
-    its interval.
+def psnr_by_bytes(results: Sequence[Result]) -> Figure:
+    """Return a panel for each capture with PSNR against bytes: A²TG of `quick`, and plain Gaussians with its kernels.
 
     Args:
-      found: comparisons by the panel's title; the first is drawn on top.
+      results: runs of E7, at least one.
     """
-    heights = [1.5 + len(rows) for rows in found.values()]
-    figure = Figure(figsize=(8.0, 0.8 + 0.26 * sum(heights)), layout="constrained")
-    panels = figure.subplots(len(found), squeeze=False, height_ratios=heights)[:, 0]
-    for axes, (title, rows) in zip(panels, found.items(), strict=True):
-        for place, row in enumerate(rows):
-            psnr = row.compared("psnr")
-            values = list(psnr.by_scene.values())
-            axes.plot(values, [place] * len(values), "o", color="#4477aa", alpha=0.35, markersize=4, markeredgewidth=0)
-            interval = {"xerr": np.nan_to_num(psnr.over_scenes.half_width), "capsize": 3}
-            axes.errorbar(psnr.over_scenes.mean, place, fmt="D", color="#000000", markersize=4, **interval)
-        axes.axvline(0.0, color="#888888", linewidth=0.8)
-        axes.set_yticks(range(len(rows)), [row.whole_text.replace("`", "") for row in rows], fontsize=8)
-        axes.set_ylim(len(rows) - 0.4, -0.6)  # The first on top.
-        axes.set_title(title, fontsize=9)
-        axes.grid(alpha=0.25, axis="x")
-    panels[-1].set_xlabel("difference of PSNR, dB")
+    sizes = sorted(set(map(bytes_per_pixel, results)))
+    by_capture = tables.grouped(results, lambda result: result.run.cell.scene.label)
+    num_rows = math.ceil(len(by_capture) / PANELS_IN_ROW)
+    figure = Figure(figsize=(8.0, 0.7 + 2.2 * num_rows), layout="constrained")
+    panels = figure.subplots(num_rows, PANELS_IN_ROW, squeeze=False, sharex=True).ravel()
+    for axes in panels[len(by_capture) :]:
+        axes.remove()
+    for axes, (capture, own) in zip(panels, by_capture, strict=False):
+        axes.set_title(capture, fontsize=9)
+        for degree, color in DEGREE_COLORS.items():
+            textured = suffixed(PRESENT, degree) + EQUAL_BYTES
+            plain = f"{suffixed(MCMC, degree)}, shapes of kernels{EQUAL_BYTES}"
+            draw_curve(axes, own, textured, f"A²TG, degree {degree}", color, "o-")
+            draw_curve(axes, own, plain, f"without textures, degree {degree}", color, "s--")
+        axes.set_xscale("log")
+        axes.set_xticks(sizes, list(map(str, sizes)))
+        axes.minorticks_off()
+        axes.grid(alpha=0.25)
+    figure.supxlabel("bytes of a model for each pixel of a photograph", fontsize=9)
+    figure.supylabel("PSNR of test views, dB", fontsize=9)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=2, fontsize=8)
     return figure
 
 
-EXPERIMENT = Experiment("findings", ("bytewise", "equal_time", "parts"), present, __doc__)
+def draw_curve(axes: Axes, results: Sequence[Result], label: str, name: str, color: str, style: str) -> None:
+    """Draw the PSNR of one method on a capture against its bytes."""
+    own = sorted((result for result in results if result.label == label), key=bytes_per_pixel)
+    figures = [result["psnr"] for result in own]
+    axes.plot(list(map(bytes_per_pixel, own)), figures, style, color=color, markersize=4, label=name)
+
+
+EXPERIMENT = Experiment("findings", ("quick_degree_3", "quick_degree_0", "quick_degree_1"), present, __doc__)

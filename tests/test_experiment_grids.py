@@ -29,7 +29,7 @@ from a2tg_jax import Term
 from a2tg_jax.base.config_json import flatten_config
 
 LARGE_SCALES = ("full", "full_size", "half_size", "long", "paper160")
-NEED_CHOICES = (("bytewise", "protocol"), ("claims", "claims"), ("confirmation", "claims"))
+NEED_CHOICES = (("claims", "claims"), ("confirmation", "claims"))
 """Grids, at a scale, of which some methods are chosen for each scene by other runs."""
 NAMES = sorted(path.stem for path in GRIDS.glob("*.toml") if path.stem not in ("methods", "scales"))
 
@@ -359,8 +359,8 @@ def test_a_plan_refuses_options_that_training_refuses(tmp_path, options, words, 
 
 
 def test_names_may_follow_options_that_can_be_repeated():
-    args = parse_arguments(experiments(), ["--only", "fox", "fixed_memory", "--only", "lego", "parts"])
-    assert (args.only, args.names) == (["fox", "lego"], ["fixed_memory", "parts"])
+    args = parse_arguments(experiments(), ["--only", "fox", "fixed_memory", "--only", "lego", "claims"])
+    assert (args.only, args.names) == (["fox", "lego"], ["fixed_memory", "claims"])
 
 
 @pytest.mark.parametrize(
@@ -497,12 +497,12 @@ def test_bytes_for_each_pixel_are_a_budget_or_a_number_of_gaussians():
 
 
 def test_a_method_of_equal_time_has_the_iterations_that_fill_the_time_of_the_reference():
-    grid = read_grid("bytewise", "smoke")
-    reference, plain = grid.jobs({})
+    grid = read_grid("claims", "smoke")
+    reference, plain, _ = grid.jobs({})
     found = {job.key: record(training_seconds=seconds) for job, seconds in ((reference, 12.0), (plain, 4.0))}
     found |= {job.start.key: record(training_seconds=seconds) for job, seconds in ((reference, 6.0), (plain, 2.0))}
     (run,) = (run for run in grid.runs(found) if run.equal)
-    assert run.label == "2DGS*-MCMC, degree 0, equal time" and run.job.all_iterations == (90, 60)
+    assert run.label == "2DGS*-MCMC, degree 0, placed, equal time" and run.job.all_iterations == (90, 60)
 
 
 @pytest.mark.parametrize(("num", "kept", "scored"), [(25, 20, 5), (67, 21, 12)])

@@ -180,7 +180,7 @@ NOTEBOOK = EXPERIMENTS / "NOTEBOOK.md"
 MADE_OF_MODELS = {"efficiency"}
 
 
-@pytest.mark.parametrize("scale", ["small", "long", "protocol", "claims"])
+@pytest.mark.parametrize("scale", ["small", "long", "protocol160", "claims"])
 def test_committed_tables_are_those_of_the_committed_records(tmp_path, scale):
     committed = EXPERIMENTS / "results" / scale
     shutil.copytree(committed.parent, tmp_path / "results")
@@ -222,6 +222,23 @@ def test_the_papers_rows_have_the_runs_that_there_are():
     ]
 
 
+def test_the_chart_shows_psnr_by_bytes_of_each_capture():
+    """A²TG is 1 dB above the same kernels without textures, and each size 1 dB above the smaller one."""
+    grid = read_grid("quick_degree_0", "protocol160")
+    records = {}
+    for run in grid.runs(records):
+        size = findings.bytes_per_pixel(tables.Result(run, record()))
+        psnr = (16, 60, 180).index(size) + (run.method.label == "A²TG, quick, degree 0")
+        records[run.job.key] = record(psnr, mb=run.cell.budget)
+    chart = findings.psnr_by_bytes(tables.results_of(grid, records))
+    assert [axes.get_title() for axes in chart.axes] == list(dict.fromkeys(cell.scene.label for cell in grid.cells))
+    for axes in chart.axes:
+        curves = {line.get_label(): line.get_xydata().tolist() for line in axes.lines}
+        assert curves["A²TG, degree 0"] == [[16, 1], [60, 2], [180, 3]]
+        assert curves["without textures, degree 0"] == [[16, 0], [60, 1], [180, 2]]
+        assert curves["A²TG, degree 3"] == curves["without textures, degree 3"] == []
+
+
 def test_the_page_has_one_size_of_the_papers_size():
     places = {}
     for degree in (3, 0):
@@ -236,11 +253,10 @@ def test_the_page_has_one_size_of_the_papers_size():
 
 
 def test_the_chosen_plain_methods_are_those_of_the_committed_validation_records():
-    for scale, path in choose_plain.FILES.items():
-        records = read_kept(EXPERIMENTS / "results" / f"{scale}-validation" / "records.json")
-        grid = read_grid("choose_plain", scale, validation=True)
-        best = choose_plain.best_methods(tables.results_of(grid, records), 1 + len(grid.methods))
-        assert best == json.loads(path.read_text(encoding="utf-8"))
+    records = read_kept(EXPERIMENTS / "results" / "claims-validation" / "records.json")
+    grid = read_grid("choose_plain", "claims", validation=True)
+    best = choose_plain.best_methods(tables.results_of(grid, records), 1 + len(grid.methods))
+    assert best == json.loads(choose_plain.CHOICES.read_text(encoding="utf-8"))
 
 
 def test_pages_show_the_committed_tables():
@@ -252,14 +268,18 @@ def test_pages_show_the_committed_tables():
     assert shown <= set(folder.glob("*/*.md"))
 
 
+def protocol_tables():
+    """Return all tables of the protocol's experiments."""
+    files = [path for scale in ("protocol160", "claims") for path in (EXPERIMENTS / "results" / scale).glob("*.md")]
+    return " ".join(path.read_text(encoding="utf-8") for path in files)
+
+
 def test_figures_in_sentences_on_results_are_in_tables():
     """On the page of results and in README's findings. The paper's gains are differences of its own figures."""
     readme = (EXPERIMENTS.parent / "README.md").read_text(encoding="utf-8")
     (sentences,) = re.findall(r"^## Findings\n(.*?)^## ", readme, re.DOTALL | re.MULTILINE)
     sentences += pages.BLOCK.sub("", RESULTS.read_text(encoding="utf-8"))
-    folder = EXPERIMENTS / "results"
-    files = [path for scale in ("protocol", "claims") for path in (folder / scale).glob("*.md")]
-    shown = " ".join(path.read_text(encoding="utf-8") for path in files)
+    shown = protocol_tables()
     with_interval = r"\d\.\d{2,}(?: ± \d\.\d{2,})?"
     figures = {f"{gain:.2f}" for gain in gains_in_the_paper()}
     figures |= {*re.findall(r"\d\.\d{2,}", shown), *re.findall(with_interval, shown)}
@@ -269,11 +289,11 @@ def test_figures_in_sentences_on_results_are_in_tables():
 
 def test_intervals_in_sentences_of_the_notebook_are_in_tables():
     """In sections that show or link to tables, except for what was measured before the protocol."""
-    shown = " ".join(path.read_text(encoding="utf-8") for path in (EXPERIMENTS / "results" / "protocol").glob("*.md"))
+    shown = protocol_tables()
     interval = r"\d\.\d{2,} ± \d\.\d{2,}"
     found = set()
     for section in NOTEBOOK.read_text(encoding="utf-8").split("\n## "):
-        if "<!-- results/protocol/" in section or "(#all-intervals-and-captures)" in section:
+        if "<!-- results/protocol160/" in section or "(#all-intervals-and-captures)" in section:
             sentences = pages.BLOCK.sub("", section)
             sentences = re.sub(r"^- \*\*Before the protocol\*\*.*?(?=^- |^$)", "", sentences, flags=re.DOTALL | re.M)
             found |= set(re.findall(interval, " ".join(sentences.split())))

@@ -15,7 +15,7 @@ FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
 SMALL = {
     "a_scene_in_five_minutes": {
         "width": 40, "height": 30, "num_views": 9, "iterations": 90, "budget": "40kB",
-        "findings": FOLDER.parent / "experiments" / "results" / "protocol" / "details.md",
+        "findings": FOLDER.parent / "experiments" / "results" / "claims" / "exploration.md",
     },
     "inverse_problems": {
         "width": 40, "height": 30, "num_views": 11, "iterations": 20, "num_gaussians": 150, "pose_iterations": 3,

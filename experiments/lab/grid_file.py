@@ -13,7 +13,7 @@ from a2tg_jax.base.text import shortened
 
 GRIDS = Path(__file__).resolve().parents[1] / "grids"
 SUFFIX = ".toml"
-SCALES = ("claims", "full", "full_size", "half_size", "long", "paper160", "protocol", "protocol160", "small", "smoke")
+SCALES = ("claims", "full", "full_size", "half_size", "long", "paper160", "protocol160", "small", "smoke")
 ONE_BYTE = 1e-6
 """A byte in MB."""
 LEAST = {

@@ -98,8 +98,6 @@ STANDARD = (
     table_experiment("quick_degree_0", "A²TG of the preset quick against plain Gaussians of degree 0 (PROTOCOL.md)."),
     table_experiment("paper_degree_3", "The paper's comparison at its length, at degree 3 (PROTOCOL.md)."),
     table_experiment("paper_degree_0", "The paper's comparison at its length, at degree 0 (PROTOCOL.md)."),
-    table_experiment("bytewise", "bytewise against the best plain method of each scene (PROTOCOL.md)."),
     table_experiment("confirmation", "bytewise on captures that nothing was tuned on (PROTOCOL.md)."),
     table_experiment("bytewise_parts", "What the present bytewise is without each of its parts (PROTOCOL.md)."),
-    table_experiment("parts", "What each part of the first version of bytewise brings (PROTOCOL.md)."),
 )
