@@ -511,7 +511,7 @@ def test_shared_stages_are_trained_once():
 def test_stages_that_differ_are_not_shared():
     changes = {
         "seed": 1, "batch_size": 2, "initial_opacity": 0.2, "background": "white", "stage1_iterations": 7,
-        "rates": LearningRates(sh_rest=1.0), "densify": Mcmc(cap=9),
+        "rates": LearningRates(sh_rest=1.0), "densify": Mcmc(cap=9), "coarse_share": 0.5,
     }  # fmt: skip
     assert len(plan_run({"a": A2tg(), "b": A2tg()}).stages) == 2
     for name, value in changes.items():
