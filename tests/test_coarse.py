@@ -10,7 +10,7 @@ from bits import bits_of
 
 import a2tg_jax as a2tg
 from a2tg_jax.scene import View
-from a2tg_jax.training import loop
+from a2tg_jax.training import batches, loop
 from a2tg_jax.training.batches import Photographs, over_background
 from a2tg_jax.training.cost import forecast_stages
 from a2tg_jax.training.start import initial_model
@@ -51,7 +51,7 @@ def with_all_parts(scene: a2tg.Scene) -> a2tg.Scene:
 
 @pytest.fixture
 def small_ones_are_halved(monkeypatch):
-    monkeypatch.setattr(loop, "LEAST_HALVED", 16)
+    monkeypatch.setattr(batches, "LEAST_HALVED", 16)
 
 
 def first_stage(scene, system, **options):
