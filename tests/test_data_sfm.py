@@ -15,6 +15,7 @@ from test_data_colmap import dot_place, write_scene as write_colmap
 
 from a2tg_jax import load_scene, look_at, run_sfm
 from a2tg_jax.cli import main as cli, make
+from a2tg_jax.cli.inputs import Sfm
 from a2tg_jax.core.origin import vertical_of
 from a2tg_jax.data import sfm, synthetic
 from a2tg_jax.data.colmap_library import pycolmap
@@ -509,7 +510,7 @@ def test_what_trains_quicker_follows_from_the_size_of_the_photographs(
     assert command.endswith(f"--preset {given}")
     advice = f"--downscale {faster} trains 2 to 3 times as fast; " if faster else ""
     assert quicker == f"quicker: {advice}a2tg make {scene} --minutes 10 chooses size and iterations for that time"
-    make.run_step("sfm", [str(tmp_path / "photos"), str(scene)])
+    make.run_step("sfm", [str(tmp_path / "photos"), str(scene)], Sfm.find_cameras)
     assert "a2tg train" not in capsys.readouterr().out, "a2tg make continues itself"
 
 

@@ -10,7 +10,7 @@ from typing import Literal
 from a2tg_jax import Scene
 from a2tg_jax.base.regular_files import expanded, is_regular
 from a2tg_jax.data.assembly import scene_name, warn_of_lenses, with_validation_views
-from a2tg_jax.data.colmap import find_models, load_colmap
+from a2tg_jax.data.colmap import find_models, load_colmap, model_files
 from a2tg_jax.data.lenses import LensUse, forget_rays
 from a2tg_jax.data.phone_captures import polycam, record3d
 from a2tg_jax.data.photo_folder import capture_hint, holds_photos, is_video
@@ -125,6 +125,21 @@ def load_scene(
 def is_scene(folder: Path) -> bool:
     """Return whether a folder holds a scene in a known format."""
     return _loader(folder) is not None
+
+
+def camera_files(path: Path) -> list[Path]:
+    """Return the files that hold the cameras and points of a scene folder or file in a known format, sorted; those of
+    other formats next to them are included."""
+    if is_regular(path):
+        return [path]
+    files = [path / name for name in BLENDER_FILES if is_regular(path / name)]
+    files += transforms_in(path)
+    for model in (*find_models(path), *find_models(path / "colmap")):
+        files += model_files(model).values()
+    for find in OTHER_PROGRAMS:
+        for cameras in find(path):
+            files += cameras.files or [cameras.file]
+    return sorted(set(files))
 
 
 def _read(path: Path, options: SceneOptions, room: int | None) -> Scene:

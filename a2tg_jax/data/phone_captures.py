@@ -44,8 +44,9 @@ def polycam(path: Path) -> list[Cameras]:
     for base in (path / "keyframes", path):
         for name, images in POLYCAM_FOLDERS:
             folder = base / name
-            if folder.is_dir() and (base / images).is_dir() and any(folder.glob("*.json")):
-                cameras.append(Cameras(folder, functools.partial(_polycam_frames, folder, base / images)))
+            files = sorted(folder.glob("*.json"))
+            if files and (base / images).is_dir():
+                cameras.append(Cameras(folder, functools.partial(_polycam_frames, folder, base / images), files))
                 break
     return cameras
 

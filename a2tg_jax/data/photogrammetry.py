@@ -250,7 +250,7 @@ def realityscan(path: Path) -> list[Cameras]:
         files = [file for file in sorted(names) if b"xcr:Rotation" in read_regular(file, MOST_BYTES)]
         # Files of another alignment may be left in one of the two.
         if files:
-            cameras.append(Cameras(files[0], functools.partial(_realityscan_frames, path, files)))
+            cameras.append(Cameras(files[0], functools.partial(_realityscan_frames, path, files), files))
     return cameras
 
 

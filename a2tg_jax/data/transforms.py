@@ -61,6 +61,8 @@ class Cameras(NamedTuple):
     """Their file or folder, which messages name."""
     read: Callable[[], Frames]
     """Function that reads them."""
+    files: Sequence[Path] = ()
+    """All files with cameras, if there are several."""
 
 
 def load_transforms(file: Path, options: SceneOptions, shelf: Shelf) -> Scene:
