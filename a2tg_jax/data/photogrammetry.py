@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from a2tg_jax.base.json_text import MOST_BYTES
+from a2tg_jax.base.json_text import MOST_BRACKETS, MOST_BYTES
 from a2tg_jax.base.regular_files import is_regular, names_in, open_regular, read_regular
 from a2tg_jax.base.text import shortened
 from a2tg_jax.data.assembly import rigid_motion
@@ -335,11 +335,15 @@ def _with_points(file: Path, frames: list[dict[str, Any]]) -> Frames:
 
 
 def _read_xml(file: Path) -> Element:
-    """Return the root of an XML file. Entity declarations, which can expand without limit, are rejected."""
+    """Return the root of an XML file. Entities, which can expand without limit, and very many elements are rejected."""
     data = read_regular(file, MOST_BYTES)
     try:
-        if b"<!ENTITY" in data or b"<!DOCTYPE" in data:
-            raise ValueError("it declares entities")
+        # Of the encodings that the parser reads, only UTF-16 would hide these bytes, and it has zeros.
+        if b"<!DOCTYPE" in data or b"\0" in data:
+            raise ValueError("it declares entities, or is UTF-16")
+        num_tags = data.count(b"<")
+        if num_tags > MOST_BRACKETS:
+            raise ValueError(f"it has {num_tags:,} tags; the limit is {MOST_BRACKETS:,}")
         return ElementTree.fromstring(data)
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise ValueError(f"{file}: cannot be read as XML ({shortened(str(error))}); export it again") from None
