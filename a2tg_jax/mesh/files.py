@@ -14,12 +14,10 @@ from a2tg_jax.base.regular_files import expanded
 from a2tg_jax.io.gltf import OWN
 from a2tg_jax.io.gltf_container import Builder, scene_of_one
 from a2tg_jax.io.other_programs import linear_colors, matrix_of, upright
-from a2tg_jax.mesh.triangles import Mesh
+from a2tg_jax.mesh.triangles import Mesh, far_middle
 
 SUFFIXES = (".glb", ".ply", ".obj")
 JPEG_QUALITY = 92
-FAR = 100.0
-"""Distance from the origin, in extents, beyond which positions are relative to the middle, for float32."""
 
 
 def check_mesh_suffix(path: str | os.PathLike[str], name: str = "path") -> None:
@@ -143,10 +141,10 @@ def _save_glb(path: Path, mesh: Mesh, origin: Similarity | Origin | None) -> Non
         raise ValueError("the mesh has no faces, and a GLB file needs one at least: write a PLY or OBJ file")
     builder = Builder()
     node: dict[str, Any] = {"name": "mesh", "mesh": 0}
-    middle = _middle(mesh.vertices) if transform is None else np.zeros(3)
+    middle = far_middle(mesh.vertices) if transform is None else np.zeros(3)
     if transform is not None:
         node["matrix"] = matrix_of(upright(origin, "y")).T.ravel().tolist()
-        if _middle(mesh.transform(transform.inverse()).vertices).any():
+        if far_middle(mesh.transform(transform.inverse()).vertices).any():
             kept = {"scale": float(transform.scale), "rotation": np.asarray(transform.rotation).tolist()}
             node["extras"] = {OWN: kept | {"translation": np.asarray(transform.translation).tolist()}}
     elif middle.any():
@@ -175,11 +173,3 @@ def _save_glb(path: Path, mesh: Mesh, origin: Similarity | Origin | None) -> Non
         described["samplers"] = [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}]
         described["textures"] = [{"source": 0, "sampler": 0}]
     builder.save(path, described)
-
-
-def _middle(vertices: np.ndarray) -> np.ndarray:
-    """Return the middle of positions far from the origin; otherwise zeros."""
-    low = vertices.min(axis=0)
-    high = vertices.max(axis=0)
-    middle = (low + high) / 2
-    return middle if np.abs(middle).max() > FAR * (high - low).max() else np.zeros(3)
