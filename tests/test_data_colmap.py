@@ -190,6 +190,12 @@ def without_camera(folder):
     change(folder / MODEL / "cameras.txt", b"\n4 PINHOLE", b"\n44 PINHOLE")
 
 
+def with_a_camera_twice(folder):
+    """As lists of two models, one after the other."""
+    without_camera(folder)
+    change(folder / MODEL / "cameras.txt", b"\n44 PINHOLE", b"\n3 PINHOLE")
+
+
 @pytest.mark.parametrize(
     ("spoil", "error", "message"),
     [
@@ -208,6 +214,7 @@ def without_camera(folder):
         (lambda folder: change(folder / MODEL / "images.bin", b"img_03.png", b"img_\xe93.png"), ValueError,
          r"images\.bin: the image name img_\\xe93.png is not UTF-8; rename"),
         (without_camera, ValueError, r"images\.txt: img_03\.png has the camera 4, which is not in cameras\.txt"),
+        (with_a_camera_twice, ValueError, r"cameras\.txt: has two cameras of one number; give each its own"),
         (as_panoramas, ValueError, "EQUIRECTANGULAR cannot be undistorted"),
     ],
 )  # fmt: skip

@@ -240,6 +240,8 @@ def _read_model(model: Path) -> SparseModel:
     files = model_files(model)
     records = {kind: read_file(file, kind) for kind, file in files.items()}
     cameras = dict(records["cameras"])
+    if len(cameras) < len(records["cameras"]):
+        raise ValueError(f"{files['cameras']}: has two cameras of one number; give each its own, in the images too")
     images = records["images"]
     text = on_disk(model, "images.txt") if files["images"].suffix.lower() == ".bin" else None
     num_in_text = len(images) if text is None else num_images(text)

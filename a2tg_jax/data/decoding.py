@@ -41,8 +41,8 @@ LENS_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model, ExifTags.Base.FocalLength,
 GPANO = re.compile(rb"""GPano:(\w+)(?:\s*=\s*["']|>)\s*([\w.]+)""")
 """Name and value in the XMP of a panorama."""
 LONGEST_REASON = 200
-LARGEST_LEVEL = {"L": 255, "I;16": 65535, "I": 65535}
-"""Largest level of grey, by Pillow's mode."""
+LARGEST_LEVEL = {"L": 255, "I;16": 65535, "I;16B": 65535, "I": 65535}
+"""Largest level of grey, by Pillow's mode. I is 16 bits of PNG, in some versions, and PPM, and 32 bits of TIFF."""
 MOST_BYTES = 1 << 30
 """Largest size of an image file: the size of the largest uncompressed picture."""
 MAX_PIXELS = 128_000_000
@@ -185,7 +185,7 @@ def read_grey(path: str | os.PathLike[str]) -> tuple[np.ndarray, int]:
     Raises as `read_pixels` does, and for colours.
     """
     with _opened(path, most_bits=16) as image:
-        if image.mode not in LARGEST_LEVEL:
+        if image.mode not in LARGEST_LEVEL or (image.mode, image.format) == ("I", "TIFF"):
             raise ValueError(
                 f"{path}: must be greyscale, of 8 or 16 bits; its mode is {image.mode}; replace or remove it"
             )

@@ -246,9 +246,11 @@ class Document:
         if not isinstance(uri, str):
             raise ValueError("the uri of a buffer is not text")
         if uri.startswith("data:"):
-            head, mark, text = uri.partition("base64,")
+            _, mark, text = uri.partition(";base64,")
+            if not mark:
+                raise ValueError("its embedded buffer is not base64, as glTF 2.0 has it; export it again")
             try:
-                return base64.b64decode(text, validate=True) if mark else urllib.parse.unquote_to_bytes(head[5:])
+                return base64.b64decode(text, validate=True)
             except binascii.Error as error:
                 raise ValueError(f"its embedded buffer is damaged ({error})") from error
         file = _named_file(self.path, uri)
