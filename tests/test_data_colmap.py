@@ -144,7 +144,10 @@ def test_model_without_points_starts_where_photographs_agree(tmp_path, text, is_
 def test_images_without_a_pose_are_counted(tmp_path):
     write_scene(tmp_path)
     Image.new("RGB", (10, 10)).save(tmp_path / "images" / "zzz.png")
-    (tmp_path / "images" / "notes.txt").touch()
+    # Files that macOS and Synology put next to photographs.
+    for name in ("notes.txt", "._img_00.png", "@eaDir/zzz.png/thumb.jpg", ".cache/zzz.png"):
+        (tmp_path / "images" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "images" / name).touch()
     with pytest.warns(UserWarning, match=r"images: 1 photograph without a pose, such as zzz\.png: not us"):
         assert len(load_scene(tmp_path).train) == 7
 

@@ -614,6 +614,18 @@ def test_pictures_that_are_no_photographs_are_left_out(tmp_path):
         find_photos(tmp_path)
 
 
+def test_photographs_where_links_lead_are_found(tmp_path):
+    """Also where a link leads to a folder above it."""
+    random = np.random.default_rng(0)
+    for name in ("photos/0.png", "photos/a/1.png", "phone/2.png", "phone/b/3.png"):
+        save_blocks(tmp_path / name, 64, 48, random)
+    photos = tmp_path / "photos"
+    (photos / "linked").symlink_to(tmp_path / "phone")
+    (photos / "a" / "again").symlink_to(photos)
+    (photos / "broken").symlink_to(tmp_path / "nothing.png")
+    assert find_photos(photos) == ["0.png", "a/1.png", "linked/2.png", "linked/b/3.png"]
+
+
 def test_pictures_of_this_program_are_left_out_under_any_name(tmp_path):
     random = np.random.default_rng(0)
     photos = [f"{index}.{suffix}" for index, suffix in enumerate(("png", "webp", "jpg", "png"))]

@@ -18,7 +18,7 @@ from a2tg_jax.base.regular_files import is_regular, read_regular
 from a2tg_jax.base.text import shortened
 from a2tg_jax.data.assembly import PointCloud
 from a2tg_jax.data.decoding import picture_size, read_grey, read_pixels
-from a2tg_jax.data.image_files import PHOTO_SUFFIXES, find_image, map_in_threads
+from a2tg_jax.data.image_files import find_image, is_photo, map_in_threads
 from a2tg_jax.data.transforms import Cameras, Frames, check_images
 
 POLYCAM_FOLDERS = (("corrected_cameras", "corrected_images"), ("cameras", "corrected_images"), ("cameras", "images"))
@@ -181,11 +181,7 @@ def _record3d_frames(file: Path) -> Frames:
 def _numbered_images(folder: Path) -> dict[int, Path]:
     """Return the images in the first of `IMAGE_FOLDERS` that has some named by number, in order of these."""
     for name in IMAGE_FOLDERS:
-        images = [
-            image
-            for image in (folder / name).glob("*")
-            if image.suffix.lower() in PHOTO_SUFFIXES and image.stem.isdecimal()
-        ]
+        images = [image for image in (folder / name).glob("*") if is_photo(image) and image.stem.isdecimal()]
         if images:
             # Reversed, because a dict keeps the last: of 0.jpg and 0.png the first by name.
             by_number = {int(image.stem): image for image in sorted(images, reverse=True)}

@@ -21,7 +21,7 @@ from a2tg_jax.base.regular_files import is_regular, names_in, open_regular, read
 from a2tg_jax.base.text import shortened
 from a2tg_jax.data.assembly import rigid_motion
 from a2tg_jax.data.decoding import picture_size
-from a2tg_jax.data.image_files import PHOTO_SUFFIXES, find_image, warn_of_unposed
+from a2tg_jax.data.image_files import files_below, find_image, is_photo, warn_of_unposed
 from a2tg_jax.data.ply import read_ply_points
 from a2tg_jax.data.transforms import Cameras, Frames, check_images
 
@@ -69,10 +69,9 @@ def _metashape_frames(file: Path) -> Frames:
     folder = file.parent
     images = folder / "images"
     below: dict[str, set[Path]] = defaultdict(set)  # Images in all folders below, with and without suffix.
-    for each in images.rglob("*"):
-        if each.suffix.lower() in PHOTO_SUFFIXES and is_regular(each):
-            below[each.name].add(each)
-            below[each.stem].add(each)
+    for each in filter(is_photo, files_below(images)):
+        below[each.name].add(each)
+        below[each.stem].add(each)
     frames = []
     lacking: list[str] = []
     for label, sensor, pose in _posed_cameras(file):
@@ -246,8 +245,9 @@ def _equidistant_terms(lens: dict[str, Any], what: str) -> dict[str, float]:
 def realityscan(path: Path) -> list[Cameras]:
     """Return the cameras of RealityScan's XMP files in a folder, and of those anywhere below its folder images."""
     cameras = []
-    for names in (path.glob("*.xmp"), (path / "images").rglob("*.xmp")):
-        files = [file for file in sorted(names) if b"xcr:Rotation" in read_regular(file, MOST_BYTES)]
+    for found in (map(path.joinpath, names_in(path)), files_below(path / "images")):
+        beside = (file for file in found if file.suffix.lower() == ".xmp" and is_regular(file))
+        files = [file for file in sorted(beside) if b"xcr:Rotation" in read_regular(file, MOST_BYTES)]
         # Files of another alignment may be left in one of the two.
         if files:
             cameras.append(Cameras(files[0], functools.partial(_realityscan_frames, path, files), files))
