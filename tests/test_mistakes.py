@@ -107,6 +107,7 @@ COMMANDS = {
     f"{NEW[:-3]}run": "--resume … --overwrite",
     "train --out nowhere --resume": "is not a run folder",
     f"{NEW[:-3]}run --resume --overwrite": "--resume … --overwrite",
+    "train --out run --resume --overwrite": "--resume continues … --overwrite replaces it: give one",
     f"{NEW[:-3]}run --resume --seed 5": "--resume … leave out --seed",
     "train --out run --resume --preset quick": "leave out --preset",
     "train photos --out run --resume": "trained on synthetic",

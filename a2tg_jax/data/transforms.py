@@ -204,6 +204,12 @@ def _read_meta(file: Path) -> dict[str, Any]:
     return meta
 
 
+def names_masks(file: Path) -> bool:
+    """Return whether a transforms file names a mask."""
+    meta = _read_meta(file)
+    return any(values.get("mask_path") for values in (meta, *meta["frames"]))
+
+
 def _read_shots(
     metas: Mapping[Path, dict[str, Any]], options: SceneOptions, shelf: Shelf, counted: Counted | None = None
 ) -> list[list[Shot]]:

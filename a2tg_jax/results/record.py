@@ -2,7 +2,7 @@
 
 It is kept as run.toml. A configuration file has the same keys; missing ones have the command line's defaults:
 
-    scene = "../scenes/fox"              # relative to the file's folder; or s3://bucket/fox, or built in: "cells"
+    scene = "../scenes/fox"              # relative to the file's folder; or built in: "cells"
     downscale = 2
     system = "a2tg"                      # or package.module:NAME
     preset = "quick"
