@@ -130,8 +130,8 @@ def is_scene(folder: Path) -> bool:
 
 
 def camera_files(path: Path) -> list[Path]:
-    """Return the files that hold the cameras and points of a scene folder or file in a known format, sorted; those of
-    other formats next to them are included."""
+    """Return the files with the cameras and points of a scene folder or file, sorted, in all known formats that are
+    there."""
     if is_regular(path):
         return [path]
     files = [path / name for name in BLENDER_FILES if is_regular(path / name)]
