@@ -166,3 +166,18 @@ def number_array(values: object, count: int | None, name: str, *, null: float | 
         wanted = f"{count or 'a list of'} finite numbers{'' if null is None else ' or null'}"
         raise ValueError(f"{name} must be {wanted}; got {shortened(values)}")
     return np.array([null if value is None else value for value in values], np.float64)
+
+
+def number_rows(values: object, width: int, name: str) -> np.ndarray:
+    """Return lists of numbers in JSON, or of texts of numbers, as float64 [N, width].
+
+    Raises:
+      ValueError: with the name, if they are anything else, or a number is not finite.
+    """
+    try:
+        rows = np.asarray(values, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        rows = np.empty(0)
+    if rows.ndim != 2 or rows.shape[1] != width or not np.isfinite(rows).all():
+        raise ValueError(f"{name} must be rows of {width} finite numbers; got {shortened(values)}")
+    return rows

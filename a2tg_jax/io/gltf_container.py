@@ -263,9 +263,8 @@ class Document:
 def buffer_files(path: Path) -> list[Path]:
     """Return the files that the buffers of a *.gltf name; none if it cannot be read."""
     try:
-        buffers = Document(path).json["buffers"]
-        uris = {buffer["uri"]: None for buffer in buffers if not buffer.get("uri", "data:").startswith("data:")}
-        return list({_named_file(path, uri): None for uri in uris})
+        uris = [buffer.get("uri", "data:") for buffer in Document(path).json["buffers"]]
+        return list(dict.fromkeys(_named_file(path, uri) for uri in uris if not uri.startswith("data:")))
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return []
 

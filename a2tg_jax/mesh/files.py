@@ -11,9 +11,11 @@ from PIL import Image
 from a2tg_jax import Origin, Similarity
 from a2tg_jax.base.atomic import replacing, write_whole
 from a2tg_jax.base.regular_files import expanded
+from a2tg_jax.data.ply import RGB
 from a2tg_jax.io.gltf import OWN
 from a2tg_jax.io.gltf_container import Builder, scene_of_one
 from a2tg_jax.io.other_programs import linear_colors, matrix_of, upright
+from a2tg_jax.io.ply import ply_header
 from a2tg_jax.mesh.triangles import Mesh, far_middle
 
 SUFFIXES = (".glb", ".ply", ".obj")
@@ -75,10 +77,10 @@ def save_mesh(path: str | os.PathLike[str], mesh: Mesh, transform: Similarity | 
     kind = "<f8" if _needs_doubles(mesh.vertices) else "<f4"
     word = "float" if kind == "<f4" else "double"
     fields: list[Any] = [("positions", kind, 3)]
-    properties = [f"property {word} {axis}" for axis in "xyz"]
+    properties = [(word, axis) for axis in "xyz"]
     if mesh.colors is not None:
         fields.append(("colors", "u1", 3))
-        properties += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
+        properties += [("uchar", channel) for channel in RGB]
     rows = np.empty(mesh.num_vertices, fields)
     rows["positions"] = mesh.vertices
     if mesh.colors is not None:
@@ -87,11 +89,9 @@ def save_mesh(path: str | os.PathLike[str], mesh: Mesh, transform: Similarity | 
     faces = np.empty(mesh.num_faces, [("number", "u1"), ("corners", "<i4", 3)])
     faces["number"] = 3
     faces["corners"] = mesh.faces
-    header = [
-        "ply", "format binary_little_endian 1.0", f"element vertex {mesh.num_vertices}", *properties,
-        f"element face {mesh.num_faces}", "property list uchar int vertex_indices", "end_header", "",
-    ]  # fmt: skip
-    write_whole(path, "\n".join(header).encode() + rows.tobytes() + faces.tobytes())
+    corners = [("list uchar int", "vertex_indices")]
+    header = ply_header([("vertex", mesh.num_vertices, properties), ("face", mesh.num_faces, corners)])
+    write_whole(path, header + rows.tobytes() + faces.tobytes())
     return [path]
 
 
