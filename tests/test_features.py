@@ -83,9 +83,31 @@ def test_gradients_in_geometry_are_those_of_differences(channels):
     assert not jnp.any(gradient.sh) and jnp.all(jnp.any(gradient.means != 0, axis=1))
 
 
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("compositor", ["native", "xla"])
+def test_a_gradient_in_features_alone_is_the_same(compositor):
+    """Its backward pass computes nothing else."""
+    features = jnp.asarray(some_features(6, 3))
+    gaussians = as_gaussians(SMOOTH, "float64")
+    textures = as_textures(SMOOTH, "float64")
+    settings = RenderSettings(capacity=1024, compositor=compositor)
+    camera = as_camera(SMOOTH, "float64")
+
+    def loss(features, gaussians, textures):
+        output = render_image(gaussians, camera, textures, features=features, settings=settings)
+        return jnp.sum(output.color**2) + jnp.sum(output.depth)
+
+    alone = jax.jit(jax.grad(loss))
+    beside = jax.jit(jax.grad(loss, argnums=(0, 1)))
+    found = alone(features, gaussians, textures)
+    assert jnp.any(found)
+    np.testing.assert_allclose(found, beside(features, gaussians, textures)[0], rtol=1e-12, atol=1e-13)
+
+
 @pytest.mark.long
 @pytest.mark.usefixtures("gpu_kernels")
-def test_gpu_kernels_show_features():
+@pytest.mark.parametrize("argnums", [(0, 1), (0,)])
+def test_gpu_kernels_show_features(argnums):
     scene = draw_scene(4, num=4, width=8, height=8)
     gaussians = as_gaussians(scene, "float32")
     camera = as_camera(scene, "float32")
@@ -96,7 +118,7 @@ def test_gpu_kernels_show_features():
         output = render_image(gaussians, camera, features=features, settings=settings)
         return jnp.sum(output.color**2) + jnp.sum(output.depth)
 
-    found, wanted = (jax.grad(loss, argnums=(0, 1))(features, gaussians, name) for name in ("cuda", "xla"))
+    found, wanted = (jax.grad(loss, argnums)(features, gaussians, name) for name in ("cuda", "xla"))
     compare = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-3)
     jax.tree.map(compare, found, wanted)
 
