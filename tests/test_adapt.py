@@ -144,6 +144,17 @@ def test_budget_is_the_greedy_choice_and_leaves_less_than_the_cheapest(budget):
         assert left >= 0 and (len(possible) == 0 or left < possible.min())
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.int32, np.uint64])
+def test_sizes_may_be_integers_of_any_kind(dtype):
+    sizes = np.asarray([[1, 1], [2, 2]], dtype)
+    larger = np.asarray([[2, 2], [2, 1]], dtype)
+    textures = allocate_textures(sizes)
+    assert textures.sizes.tolist() == sizes.tolist()
+    assert reallocate(textures, larger).textures.sizes.tolist() == larger.tolist()
+    mask = select(np.ones(2), sizes, larger, budget_bytes=1000)
+    assert mask.tolist() == [True, False], "a texture that would shrink is not chosen"
+
+
 @pytest.mark.parametrize(
     ("function", "message"),
     [
