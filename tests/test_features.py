@@ -9,7 +9,16 @@ import oracle
 import pytest
 from scenes_random import as_camera, as_gaussians, as_textures, draw_scene, draw_smooth_scene, quick_then_long
 
-from a2tg_jax import Appearance, Model, Renderer, RenderSettings, pytree, render_appearance, render_image
+from a2tg_jax import (
+    Appearance,
+    Model,
+    Renderer,
+    RenderSettings,
+    pytree,
+    render_appearance,
+    render_image,
+    view_gradients,
+)
 
 SCENE = draw_scene(4, num=8, width=11, height=9)
 SMOOTH = draw_smooth_scene(53, width=8, height=8)
@@ -160,6 +169,28 @@ def test_an_appearance_may_have_other_colours_than_three():
     shifted = Renderer(model, background=(0.5, 0.25))(camera)
     added = np.multiply.outer(1 - np.asarray(shifted.alpha), [0.5, 0.25])
     np.testing.assert_allclose(shifted.color - color, added, atol=1e-6)
+
+
+@pytest.mark.parametrize("background", [None, (0.5, 0.25)])
+def test_gradients_of_views_take_other_colours_than_three(background):
+    gaussians = as_gaussians(SCENE, "float32")
+    camera = as_camera(SCENE, "float32")
+    model = Model(gaussians, Two(), background=(1.0, 1.0, 1.0))
+    found = view_gradients(lambda _, output: jnp.mean(output.color), model, camera, background=background)
+    drawn = model.render(camera, background=background)
+    np.testing.assert_allclose(found.value, jnp.mean(drawn.color), rtol=1e-6)
+
+
+def test_a_background_of_traced_numbers():
+    """The image is linear in the background, with the transmittance as its factor."""
+    gaussians = as_gaussians(SCENE, "float32")
+    camera = as_camera(SCENE, "float32")
+
+    def total(red):
+        return jnp.sum(render_image(gaussians, camera, background=[red, 0.0, 0.0]).color)
+
+    transmittance = 1 - render_image(gaussians, camera).alpha
+    np.testing.assert_allclose(jax.grad(total)(0.5), jnp.sum(transmittance), rtol=1e-5)
 
 
 def test_mistakes_are_named():
