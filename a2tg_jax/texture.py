@@ -60,8 +60,8 @@ def check_textures(textures: Textures, num: int | None = None) -> None:
 
 
 def checked_sizes(sizes: ArrayLike, name: str = "sizes") -> np.ndarray:
-    """Return the sizes of textures as int64 (host). ValueError: they are not integers [N, 2], each side 1 to 16, or both
-    0."""
+    """Return the sizes of textures as int64 (host). ValueError: they are not integers [N, 2], each side 1 to 16, or
+    both 0."""
     if isinstance(sizes, Table):
         raise ValueError(f"{name} must be integers [N, 2]; got {type(sizes).__name__}: pass textures.sizes")
     check_unmasked(name, sizes)
@@ -71,9 +71,7 @@ def checked_sizes(sizes: ArrayLike, name: str = "sizes") -> np.ndarray:
     is_wrong = ((sizes < 1) | (sizes > MAX_SIDE)).any(axis=1) & (sizes != 0).any(axis=1)
     if is_wrong.any():
         wrong = sizes[is_wrong]
-        raise ValueError(
-            f"{name}: texture sides must be in 1..{MAX_SIDE}, or both 0; got {wrong.min()}..{wrong.max()}"
-        )
+        raise ValueError(f"{name}: texture sides must be in 1..{MAX_SIDE}, or both 0; got {wrong.min()}..{wrong.max()}")
     # Unsigned integers would wrap around in differences, and become floats in products with signed ones.
     return sizes.astype(np.int64)
 

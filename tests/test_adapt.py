@@ -345,6 +345,7 @@ def test_padding_is_neutral_and_has_no_moments():
         (Upscale("threshold"), r"Upscale\.select is 'threshold', so it needs threshold, an average gradient$"),
         (Upscale("budget"), r"Upscale\.select is 'budget', so it needs budget_mb, in MB \(10\^6 bytes\)$"),
         (Upscale(cap=32), r"Upscale\.cap must be at least 1 and at most 16; got 32$"),
+        (Upscale(cap=4.0), r"Upscale\.cap must be int; got 4\.0$"),
         (Upscale(fraction=1.5), r"Upscale\.fraction must be at least 0 and at most 1; got 1\.5$"),
     ],
 )
