@@ -8,6 +8,7 @@ import sys
 from types import SimpleNamespace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiled_programs import compiled_programs
@@ -308,6 +309,14 @@ def test_a_later_stage_beyond_the_machine_is_refused_before_the_first(monkeypatc
             check_rows_fit(scene, system, first, num_start, machine.Devices())
     check_rows_fit(scene, system, 0, None, machine.Devices(), max_memory=limits[1])
     check_rows_fit(scene, system, 0, None, machine.Devices(1, 2))  # Other machines' memory is not known.
+
+
+def test_numbers_of_events_may_be_arrays():
+    system = a2tg.A2tg.preset("smoke")
+    fraction = jnp.asarray(system.texture.fraction)
+    of_array = dataclasses.replace(system, texture=dataclasses.replace(system.texture, fraction=fraction))
+    found = check_rows_fit(SMALL, of_array, 0, None, machine.Devices())
+    assert found == check_rows_fit(SMALL, system, 0, None, machine.Devices())
 
 
 def test_the_start_is_named_if_it_is_too_large(monkeypatch):

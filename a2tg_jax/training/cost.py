@@ -76,7 +76,7 @@ def forecast_stages(
             shared = stage.shared_bytes
         model_bytes = BYTES_PER_FLOAT * (own_floats + floats) * num + shared
         for event in stage.events:
-            model_bytes = event.most_bytes(model_bytes, num, stage.iterations)
+            model_bytes = float(event.most_bytes(model_bytes, num, stage.iterations))
         floats = (model_bytes - shared) / BYTES_PER_FLOAT / num - own_floats
         on_host = [event for event in stage.events if isinstance(event, HostEvent)]
         # One for halved photographs, and one for whole ones.
