@@ -117,6 +117,14 @@ def parse_toml(data: bytes) -> dict[str, Any]:
     return _parsed(lambda: tomllib.loads(data.decode("utf-8")))
 
 
+def read_toml(file: Path) -> dict[str, Any]:
+    """Return the table in a TOML file. Raises as `read_regular`, and ValueError, naming the file, if it is not TOML."""
+    try:
+        return parse_toml(read_regular(file, MOST_TOML_BYTES))
+    except ValueError as error:
+        raise ValueError(f"{file}: is not valid TOML: {shortened(str(error), 200)}") from error
+
+
 def _check_size(data: bytes, most: int) -> None:
     if len(data) > most:
         raise ValueError(f"it has {len(data):,} bytes; the limit is {most:,}")
