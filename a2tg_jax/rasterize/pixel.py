@@ -251,8 +251,8 @@ def blend_vjp(
     """Differentiate `blend`, with `suffix_sum` as for `absorb_vjp` and the cotangents g of the channels.
 
     Returns (transmittance, is_live, suffix_sum) behind the splat, its weight, and its Cotangents. These are valid only
-    if the weight is positive; elsewhere they may not even be finite. With `only_colors`, all others than those of the
-    colours are zero, and nothing depends on `suffix_sum`.
+    if the weight is positive; elsewhere they may not even be finite. With `only_colors`, only the colours have
+    any that are not zero, and nothing depends on `suffix_sum`.
     """
 
     def of_floats(
