@@ -232,6 +232,7 @@ def test_bad_input_is_named(tmp_path, spoil, error, message):
     ("options", "message"),
     [
         ({"downscale": 0}, "downscale must be"), ({"test_every": 1}, "test_every must be"),
+        ({"test_every": 2.5}, "or a whole number of at least 2; got 2.5"),
         ({"room": -1}, "room must be at least 0 bytes; got -1"),
     ],
 )  # fmt: skip

@@ -32,7 +32,7 @@ def parse_json(text: str | bytes, *, allow_nan: bool = False) -> Any:
     """Return the value of a JSON text.
 
     Args:
-      text: the text, or UTF-8.
+      text: the text, or its bytes in UTF-8, UTF-16 or UTF-32.
       allow_nan: whether to accept floats that overflow, NaN and infinities, which are not JSON but which Python's own
         library writes.
 
@@ -58,8 +58,8 @@ def parse_json(text: str | bytes, *, allow_nan: bool = False) -> Any:
             raise ValueError(f"a number of {len(digits)} digits is too large")
         return int(digits)
 
-    text = data.decode("utf-8-sig", "surrogatepass")  # json rejects a byte order mark.
-    return _parsed(lambda: json.loads(text, parse_constant=number, parse_int=integer, parse_float=number))
+    # Of bytes, json detects the encoding, and skips a byte order mark.
+    return _parsed(lambda: json.loads(data, parse_constant=number, parse_int=integer, parse_float=number))
 
 
 def read_json(file: Path, *, allow_nan: bool = True) -> Any:

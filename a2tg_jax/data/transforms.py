@@ -219,7 +219,11 @@ def _read_shots(
     """
     photos = []
     for file, meta in metas.items():
-        photos += [_photo(file, {**meta, **frame}, options.lens, counted) for frame in meta["frames"]]
+        without_focal = {key: value for key, value in meta.items() if not key.startswith("fl_")}
+        for frame in meta["frames"]:
+            # The file's focal length would be preferred to the frame's angle.
+            shared = without_focal if {"camera_angle_x", "camera_angle_y"} & frame.keys() else meta
+            photos.append(_photo(file, {**shared, **frame}, options.lens, counted))
     place = next(iter(metas))
     read = read_photos(photos, options, shelf, place, place.parent, lambda name: f"remove its frame from {place}")
     shots = iter(read)
