@@ -186,14 +186,18 @@ def _skipped(folder: Path, files: list[Path]) -> str:
         f"Skipped: {', '.join(parts)}{', …' if len(counts) > MOST_TOLD else ''}; read: {', '.join(PHOTO_SUFFIXES)}; "
         f"videos: {', '.join(VIDEO_SUFFIXES[:MOST_TOLD])}, …"
     )
-    foreign = next((file for file in files if file.suffix.lower() in FOREIGN_SUFFIXES), None)
-    video = next((file for file in files if file.suffix.lower() in VIDEO_SUFFIXES), None)
-    spherical = next((file for file in files if file.suffix.lower() in SPHERICAL_SUFFIXES), None)
+
+    def first_of(suffixes: Sequence[str]) -> Path | None:
+        return next((file for file in files if file.suffix.lower() in suffixes), None)
+
+    spherical = first_of(SPHERICAL_SUFFIXES)
     if spherical is not None:
         message += f". {spherical} {capture_hint(spherical)}"
+    foreign = first_of(FOREIGN_SUFFIXES)
     if foreign is not None:
         pattern = as_argument(folder / foreign.parent / f"*{foreign.suffix}")  # ImageMagick itself expands the star.
         message += f". To make JPEG files of them: magick mogrify -format jpg {pattern}"
+    video = first_of(VIDEO_SUFFIXES)
     if video is not None:
         message += f". A video is given by itself: a2tg sfm {as_argument(folder / video)} SCENE"
     return message

@@ -236,10 +236,6 @@ def _photo(file: Path, frame: dict[str, Any], use: LensUse, counted: Counted | N
         raise ValueError(f"{file}: a frame lacks file_path or transform_matrix")
     name = frame["file_path"]
     what = f"{file}: {name}"
-    # Without a size in the frame, the lens needs the full image's, once that is found.
-    lens: Lens | Callable[[tuple[int, int]], Lens] = functools.partial(_lens, frame, what, use)
-    if all(frame.get(side) and lenient_number(frame[side], f"{what}: {side}") for side in "wh"):
-        lens = _lens(frame, what, use, (0, 0))
     path = file.parent / name
     images = file.parent / "images"
     return Photo(
@@ -247,7 +243,8 @@ def _photo(file: Path, frame: dict[str, Any], use: LensUse, counted: Counted | N
         _viewmat(frame["transform_matrix"], what),
         (path.parent, path.name),
         (images, path.relative_to(images).as_posix()) if path.is_relative_to(images) else None,
-        lens,
+        # Without a size in the frame, the lens needs the full image's, once that is found.
+        functools.partial(_lens, frame, what, use),
         what,
         mask=file.parent / frame["mask_path"] if frame.get("mask_path") else None,
         depths=file.parent / frame["depth_file_path"] if frame.get("depth_file_path") else None,

@@ -134,6 +134,8 @@ def _edit_of(data: dict[str, Any]) -> Edit:
     if background is not None:
         red, green, blue = number_array(background, 3, "background").tolist()
         background = (red, green, blue)
+        if min(background) < 0 or max(background) > 1:
+            raise ValueError(f"background must be numbers from 0 to 1; got {background}")
     return Edit(crop, float(floaters), up, background, subject)
 
 

@@ -10,6 +10,7 @@ from PIL import Image
 
 from a2tg_jax import Origin, Similarity
 from a2tg_jax.base.atomic import replacing, write_whole
+from a2tg_jax.base.config_json import config_to_dict
 from a2tg_jax.base.regular_files import expanded
 from a2tg_jax.data.ply import RGB
 from a2tg_jax.io.gltf import OWN
@@ -145,8 +146,7 @@ def _save_glb(path: Path, mesh: Mesh, origin: Similarity | Origin | None) -> Non
     if transform is not None:
         node["matrix"] = matrix_of(upright(origin, "y")).T.ravel().tolist()
         if far_middle(mesh.transform(transform.inverse()).vertices).any():
-            kept = {"scale": float(transform.scale), "rotation": np.asarray(transform.rotation).tolist()}
-            node["extras"] = {OWN: kept | {"translation": np.asarray(transform.translation).tolist()}}
+            node["extras"] = {OWN: config_to_dict(transform)}
     elif middle.any():
         node["translation"] = middle.tolist()
     attributes = {"POSITION": builder.add((mesh.vertices - middle).astype(np.float32), has_bounds=True)}
