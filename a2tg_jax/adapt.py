@@ -250,7 +250,7 @@ def next_sizes(
       array([[2, 2],
              [1, 2]])
     """
-    sizes = checked_sizes(sizes).astype(np.int64)
+    sizes = checked_sizes(sizes)
     check_shape("scales", scales, sizes.shape)
     scales = np.asarray(scales)
     if (scales < 0).any():
@@ -334,8 +334,8 @@ def select(
       array([ True, False,  True])
     """
     statistic = np.asarray(statistic)
-    sizes = np.asarray(sizes)
-    proposed = np.asarray(proposed)
+    sizes = checked_sizes(sizes)
+    proposed = checked_sizes(proposed, "proposed")
     check_shape("statistic", statistic, ("N",))
     check_shape("sizes", sizes, (len(statistic), 2))
     check_shape("proposed", proposed, (len(statistic), 2))

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.base.checks import check_int, check_number, check_shape
+from a2tg_jax.base.checks import check_count, check_number, check_shape
 from a2tg_jax.core.budget import number_to_reach
 from a2tg_jax.core.gaussians import DEAD_OPACITY, MAX_SHARES, Gaussians, check_gaussians, share
 from a2tg_jax.core.optim import AdamState
@@ -35,7 +35,7 @@ class MoveInfo(NamedTuple):
     """Counts of one event; scalars, traced."""
 
     num_dead: Array
-    """Live rows found dead by `relocate`, all of them moved; 0 from `grow`."""
+    """Live rows found dead by `relocate`, all of them moved if there are hosts; 0 from `grow`."""
     num_added: Array
     """Rows added by `grow`; 0 from `relocate`."""
     has_hosts: Array
@@ -72,7 +72,7 @@ def relocate(key: Array, gaussians: Gaussians, moments: Any, num_live: Array | i
       the scalars `num_dead`, `num_added` and `has_hosts`.
 
     Raises:
-      ValueError: if a leaf of `moments` has another leading axis.
+      ValueError: if a count that is not traced is no integer in 0..N, or a leaf of `moments` has another leading axis.
 
     Examples:
       >>> state = a2tg.adam_init(gaussians)
@@ -104,7 +104,8 @@ def grow(key: Array, gaussians: Gaussians, moments: Any, num_live: Array | int, 
       scalars `num_dead`, `num_added` and `has_hosts`.
 
     Raises:
-      ValueError: if a count or a cap that is not traced exceeds N, or a leaf of `moments` has another leading axis.
+      ValueError: if a count or a cap that is not traced is no integer in 0..N, or a leaf of `moments` has another
+        leading axis.
 
     Examples:
       >>> state = a2tg.adam_init(gaussians)
@@ -113,9 +114,7 @@ def grow(key: Array, gaussians: Gaussians, moments: Any, num_live: Array | int, 
       105
     """
     _check_moments(gaussians, moments, num_live)
-    check_shape("cap", cap, ())
-    if not isinstance(cap, jax.core.Tracer) and int(cap) > gaussians.num:
-        raise ValueError(f"cap must be at most the {gaussians.num} rows that are allocated; got {int(cap)}")
+    check_count("cap", cap, gaussians.num)
     num_live = jnp.asarray(num_live, jnp.int32)
     return _moved(gaussians, moments, num_live, plan_growth(key, gaussians.opacities, num_live, cap))
 
@@ -205,9 +204,9 @@ def perturb(
       (200, 3)
     """
     check_gaussians(gaussians)
-    _check_num_live(gaussians, num_live)
+    check_count("num_live", num_live, gaussians.num)
     check_shape("lr", lr, ())
-    scales = gaussians.scales if scales is None else scales
+    scales = gaussians.scales if scales is None else jnp.asarray(scales)
     check_shape("scales", scales, (gaussians.num, 3 if np.shape(scales)[1:] == (3,) else 2))
     means = gaussians.means
     dtype = gaussians.means.dtype
@@ -275,16 +274,10 @@ def _moved(gaussians: Gaussians, moments: Any, num_live: Array, moves: Moves) ->
     return MoveResult(copied, moments, num_live + moves.info.num_added, moves.info)
 
 
-def _check_num_live(gaussians: Gaussians, num_live: Array | int) -> None:
-    check_shape("num_live", num_live, ())
-    if not isinstance(num_live, jax.core.Tracer):
-        check_int("num_live", np.asarray(num_live).item(), 0, gaussians.num)
-
-
 def _check_moments(gaussians: Gaussians, moments: object, num_live: Array | int) -> None:
     """Raise ValueError unless the Gaussians are well formed and every leaf has one row for each of them."""
     check_gaussians(gaussians)
-    _check_num_live(gaussians, num_live)
+    check_count("num_live", num_live, gaussians.num)
     rows = (moments.mu, moments.nu) if isinstance(moments, AdamState) else moments
     for path, leaf in jax.tree_util.tree_leaves_with_path(rows):
         if np.ndim(leaf) == 0 or np.shape(leaf)[0] != gaussians.num:

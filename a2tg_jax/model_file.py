@@ -208,16 +208,9 @@ def origin_header(origin: Origin) -> dict[str, Any]:
 
 def origin_arrays(origin: Origin) -> dict[str, np.ndarray]:
     """Return the numbers of an origin."""
-    world = origin.transform
-    return {
-        "viewmats": origin.viewmats,
-        "Ks": origin.Ks,
-        "sizes": origin.sizes,
-        "is_test": origin.is_test,
-        "scale": np.asarray(world.scale, np.float64),
-        "rotation": np.asarray(world.rotation, np.float64),
-        "translation": np.asarray(world.translation, np.float64),
-    }
+    of_cameras = {name: getattr(origin, name) for name in ("viewmats", "Ks", "sizes", "is_test")}
+    world = dataclasses.asdict(origin.transform)
+    return of_cameras | {name: np.asarray(numbers, np.float64) for name, numbers in world.items()}
 
 
 def origin_shapes(num: int) -> dict[str, tuple[int, ...]]:

@@ -200,6 +200,9 @@ def background_array(background: ArrayLike, gaussians: Gaussians, num_colors: in
     """Return the background as an array of the dtype in which Gaussians are drawn. ValueError: it is not one colour, of
     `num_colors` numbers."""
     check_unmasked("background", background)
+    # A list may hold tracers, which NumPy does not take.
+    if any(isinstance(leaf, Array) for leaf in jax.tree.leaves(background)):
+        background = jnp.asarray(background)
     if np.ndim(background) == 3:
         raise ValueError(
             f"background must be one colour [3]; got {[*np.shape(background)]}. To put an image behind the splats, "
@@ -210,8 +213,8 @@ def background_array(background: ArrayLike, gaussians: Gaussians, num_colors: in
     check_shape("background", background, (num_colors,))
     # Without x64, JAX draws Gaussians of NumPy in float32 even if they are float64.
     dtype = jnp.result_type(gaussians.means)
-    if any(isinstance(leaf, Array) for leaf in jax.tree.leaves(background)):
-        return jnp.asarray(background, dtype)
+    if isinstance(background, Array):
+        return background.astype(dtype)
     # An explicit transfer, which `jax.transfer_guard` lets pass.
     return jax.device_put(np.asarray(background, dtype))
 

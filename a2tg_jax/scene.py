@@ -130,7 +130,7 @@ class Scene(NamedFields):
 
 def check_scene(scene: Scene) -> None:
     """Raise ValueError, naming the field or the view, unless there are valid training views, of different names, and
-    all numbers are valid."""
+    points and colours of right shapes. Whether points are finite is checked where Gaussians start from them."""
     if not isinstance(scene.train, tuple | list) or not all(isinstance(view, View) for view in scene.train):
         raise ValueError(f"scene.train must be a tuple of views; got {shortened(scene.train)}")
     if not scene.train:

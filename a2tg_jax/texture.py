@@ -60,7 +60,7 @@ def check_textures(textures: Textures, num: int | None = None) -> None:
 
 
 def checked_sizes(sizes: ArrayLike, name: str = "sizes") -> np.ndarray:
-    """Return the sizes of textures as an array (host). ValueError: they are not integers [N, 2], each side 1 to 16, or
+    """Return the sizes of textures as int64 (host). ValueError: they are not integers [N, 2], each side 1 to 16, or
     both 0."""
     if isinstance(sizes, Table):
         raise ValueError(f"{name} must be integers [N, 2]; got {type(sizes).__name__}: pass textures.sizes")
@@ -71,8 +71,9 @@ def checked_sizes(sizes: ArrayLike, name: str = "sizes") -> np.ndarray:
     is_wrong = ((sizes < 1) | (sizes > MAX_SIDE)).any(axis=1) & (sizes != 0).any(axis=1)
     if is_wrong.any():
         wrong = sizes[is_wrong]
-        raise ValueError(f"texture sides must be in 1..{MAX_SIDE}, or both 0; got {wrong.min()}..{wrong.max()}")
-    return sizes
+        raise ValueError(f"{name}: texture sides must be in 1..{MAX_SIDE}, or both 0; got {wrong.min()}..{wrong.max()}")
+    # Unsigned integers would wrap around in differences, and become floats in products with signed ones.
+    return sizes.astype(np.int64)
 
 
 def allocate_textures(sizes: ArrayLike, *, rgb: float = 0.0, dtype: DTypeLike = jnp.float32) -> Textures:
@@ -124,7 +125,7 @@ def textures_from_arrays(arrays: Sequence[ArrayLike]) -> Textures:
             raise ValueError(f"texture {index} must be [Tv, Tu, 4]; got {array.shape}")
         if not jnp.issubdtype(array.dtype, jnp.floating):
             raise ValueError(f"texture {index} must be floats; got {array.dtype}")
-    sizes = checked_sizes(np.array([array.shape[:2] for array in textures], np.int64).reshape(-1, 2))
+    sizes = checked_sizes(np.array([array.shape[:2] for array in textures], int).reshape(-1, 2))
     # Gives the result its dtype and number of channels if there are no textures.
     empty = np.zeros((0, 4), textures[0].dtype if textures else np.float32)
     return Textures.of_flat(sizes, np.concatenate([empty, *(array.reshape(-1, 4) for array in textures)]))

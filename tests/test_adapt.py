@@ -144,6 +144,17 @@ def test_budget_is_the_greedy_choice_and_leaves_less_than_the_cheapest(budget):
         assert left >= 0 and (len(possible) == 0 or left < possible.min())
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.int32, np.uint64])
+def test_sizes_may_be_integers_of_any_kind(dtype):
+    sizes = np.asarray([[1, 1], [2, 2]], dtype)
+    larger = np.asarray([[2, 2], [2, 1]], dtype)
+    textures = allocate_textures(sizes)
+    assert textures.sizes.tolist() == sizes.tolist()
+    assert reallocate(textures, larger).textures.sizes.tolist() == larger.tolist()
+    mask = select(np.ones(2), sizes, larger, budget_bytes=1000)
+    assert mask.tolist() == [True, False], "a texture that would shrink is not chosen"
+
+
 @pytest.mark.parametrize(
     ("function", "message"),
     [
@@ -334,6 +345,7 @@ def test_padding_is_neutral_and_has_no_moments():
         (Upscale("threshold"), r"Upscale\.select is 'threshold', so it needs threshold, an average gradient$"),
         (Upscale("budget"), r"Upscale\.select is 'budget', so it needs budget_mb, in MB \(10\^6 bytes\)$"),
         (Upscale(cap=32), r"Upscale\.cap must be at least 1 and at most 16; got 32$"),
+        (Upscale(cap=4.0), r"Upscale\.cap must be int; got 4\.0$"),
         (Upscale(fraction=1.5), r"Upscale\.fraction must be at least 0 and at most 1; got 1\.5$"),
     ],
 )

@@ -325,6 +325,20 @@ def test_metashape_that_cannot_be_read(tmp_path, xml, message):
         load_scene(tmp_path)
 
 
+def test_xml_of_too_many_elements_or_with_entities_in_another_encoding_is_refused(tmp_path):
+    """Elements take 50 times their bytes of memory; expat reads UTF-16, in which a search for ASCII finds nothing."""
+    save_dots(tmp_path / "images", [f"{index}.png" for index in range(COUNT)])
+    xmp = tmp_path / "images" / "0.xmp"
+    entity = '<?xml version="1.0" encoding="utf-16"?><!DOCTYPE a [<!ENTITY e "long">]><a>&e;&e;</a><!--{}-->'
+    # The letters of this comment have the bytes by which XMP files of RealityScan are recognised.
+    xmp.write_bytes(entity.format(b"xcr:Rotation".decode("utf-16-le")).encode("utf-16"))
+    with pytest.raises(ValueError, match=r"0\.xmp: cannot be read as XML \(it declares entities, or is UTF-16\)"):
+        load_scene(tmp_path)
+    xmp.write_bytes(b"<xcr:Rotation>" + b"<a>" * 500_000)
+    with pytest.raises(ValueError, match=r"0\.xmp: cannot be read as XML \(it has 500,001 tags; the limit is 500,000"):
+        load_scene(tmp_path)
+
+
 def realityscan_xmp(pose, position=(0, 0, 0), more='xcr:DistortionCoeficients="-0.1 0.02 0 0 0 0"'):
     """XMP as RealityCapture's page on its camera mathematics has it: lengths in units of the longer side."""
     rotation = (pose @ OPENCV)[:3, :3].T

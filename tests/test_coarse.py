@@ -10,7 +10,7 @@ from bits import bits_of
 
 import a2tg_jax as a2tg
 from a2tg_jax.scene import View
-from a2tg_jax.training import loop
+from a2tg_jax.training import batches, loop
 from a2tg_jax.training.batches import Photographs, over_background
 from a2tg_jax.training.cost import forecast_stages
 from a2tg_jax.training.start import initial_model
@@ -51,7 +51,7 @@ def with_all_parts(scene: a2tg.Scene) -> a2tg.Scene:
 
 @pytest.fixture
 def small_ones_are_halved(monkeypatch):
-    monkeypatch.setattr(loop, "LEAST_HALVED", 16)
+    monkeypatch.setattr(batches, "LEAST_HALVED", 16)
 
 
 def first_stage(scene, system, **options):
@@ -161,6 +161,19 @@ def test_a_wrong_share_is_refused(share):
 def test_more_iterations_see_whole_photographs():
     system = dataclasses.replace(SYSTEM, coarse_share=0.5, stage2_iterations=0, more=(10,))
     assert [stage.num_coarse for stage in system.all_stages()] == [12, 0]
+
+
+def test_masks_of_which_no_four_pixels_count(tmp_path):
+    """No pixel of the halved photographs counts, so that there is no error."""
+    is_odd = np.indices((18, 24)).sum(0) % 2 == 1
+    masked = dataclasses.replace(SMALL, train=tuple(dataclasses.replace(view, mask=is_odd) for view in SMALL.train))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loop, "LEAST_HALVED", 16)
+        system = a2tg.Gaussians2dMcmc.preset("smoke", stage1_iterations=10, coarse_share=1.0, loss={"ssim_weight": 0.0})
+        result = a2tg.fit(masked, system)
+    assert result.history.psnr.tolist() == [np.inf] and result.history.loss.tolist() == [0]
+    a2tg.save_checkpoint(tmp_path / "checkpoint.npz", result.checkpoint)
+    assert a2tg.load_checkpoint(tmp_path / "checkpoint.npz").history.psnr.tolist() == [np.inf]
 
 
 def test_halved_photographs():

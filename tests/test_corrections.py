@@ -18,6 +18,7 @@ from a2tg_jax import (
     Gaussians2dMcmc,
     LossConfig,
     Mcmc,
+    Origin,
     PoseRefinement,
     adam_init,
     adam_update,
@@ -32,7 +33,7 @@ from a2tg_jax import (
     synthetic_scene,
 )
 from a2tg_jax.training import SYSTEMS
-from a2tg_jax.training.corrections import initial_corrections, updated
+from a2tg_jax.training.corrections import corrected_origin, initial_corrections, updated
 
 SYSTEM = Gaussians2dMcmc(
     stage1_iterations=24, stage2_iterations=16, initial_gaussians=80, densify=Mcmc(cap=90), exposure=True,
@@ -162,6 +163,18 @@ def test_the_origin_has_the_cameras_as_they_were_refined(scene, trained, tmp_pat
     save_compact(tmp_path / "model.a2tgz", model)
     assert load_compact(tmp_path / "model.a2tgz").origin.corrections == {}
     assert model.num_bytes == dataclasses.replace(model, origin=None).num_bytes
+
+
+def test_cameras_are_made_once_for_all_corrections(scene, monkeypatch):
+    calls = []
+    cameras = Origin.cameras.fget
+    monkeypatch.setattr(Origin, "cameras", property(lambda origin: calls.append(origin) or cameras(origin)))
+    names = [view.name for view in scene.train]
+    corrections = [PoseRefinement()]
+    states = initial_corrections(corrections, names, None, np.float32)
+    corrected = corrected_origin(scene.origin, corrections, states)
+    np.testing.assert_allclose(corrected.viewmats, scene.origin.viewmats, atol=1e-6)
+    assert len(calls) == 1
 
 
 def test_a_checkpoint_of_another_number_of_views_is_refused(scene, trained):

@@ -144,7 +144,10 @@ def test_model_without_points_starts_where_photographs_agree(tmp_path, text, is_
 def test_images_without_a_pose_are_counted(tmp_path):
     write_scene(tmp_path)
     Image.new("RGB", (10, 10)).save(tmp_path / "images" / "zzz.png")
-    (tmp_path / "images" / "notes.txt").touch()
+    # Files that macOS and Synology put next to photographs.
+    for name in ("notes.txt", "._img_00.png", "@eaDir/zzz.png/thumb.jpg", ".cache/zzz.png"):
+        (tmp_path / "images" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "images" / name).touch()
     with pytest.warns(UserWarning, match=r"images: 1 photograph without a pose, such as zzz\.png: not us"):
         assert len(load_scene(tmp_path).train) == 7
 
@@ -190,6 +193,12 @@ def without_camera(folder):
     change(folder / MODEL / "cameras.txt", b"\n4 PINHOLE", b"\n44 PINHOLE")
 
 
+def with_a_camera_twice(folder):
+    """As lists of two models, one after the other."""
+    without_camera(folder)
+    change(folder / MODEL / "cameras.txt", b"\n44 PINHOLE", b"\n3 PINHOLE")
+
+
 @pytest.mark.parametrize(
     ("spoil", "error", "message"),
     [
@@ -208,6 +217,7 @@ def without_camera(folder):
         (lambda folder: change(folder / MODEL / "images.bin", b"img_03.png", b"img_\xe93.png"), ValueError,
          r"images\.bin: the image name img_\\xe93.png is not UTF-8; rename"),
         (without_camera, ValueError, r"images\.txt: img_03\.png has the camera 4, which is not in cameras\.txt"),
+        (with_a_camera_twice, ValueError, r"cameras\.txt: has two cameras of one number; give each its own"),
         (as_panoramas, ValueError, "EQUIRECTANGULAR cannot be undistorted"),
     ],
 )  # fmt: skip
@@ -222,6 +232,7 @@ def test_bad_input_is_named(tmp_path, spoil, error, message):
     ("options", "message"),
     [
         ({"downscale": 0}, "downscale must be"), ({"test_every": 1}, "test_every must be"),
+        ({"test_every": 2.5}, "or a whole number of at least 2; got 2.5"),
         ({"room": -1}, "room must be at least 0 bytes; got -1"),
     ],
 )  # fmt: skip

@@ -15,6 +15,7 @@ from test_data_colmap import dot_place, write_scene as write_colmap
 
 from a2tg_jax import load_scene, look_at, run_sfm
 from a2tg_jax.cli import main as cli, make
+from a2tg_jax.cli.inputs import Sfm
 from a2tg_jax.core.origin import vertical_of
 from a2tg_jax.data import sfm, synthetic
 from a2tg_jax.data.colmap_library import pycolmap
@@ -509,7 +510,7 @@ def test_what_trains_quicker_follows_from_the_size_of_the_photographs(
     assert command.endswith(f"--preset {given}")
     advice = f"--downscale {faster} trains 2 to 3 times as fast; " if faster else ""
     assert quicker == f"quicker: {advice}a2tg make {scene} --minutes 10 chooses size and iterations for that time"
-    make.run_step("sfm", [str(tmp_path / "photos"), str(scene)])
+    make.run_step("sfm", [str(tmp_path / "photos"), str(scene)], Sfm.find_cameras)
     assert "a2tg train" not in capsys.readouterr().out, "a2tg make continues itself"
 
 
@@ -611,6 +612,18 @@ def test_pictures_that_are_no_photographs_are_left_out(tmp_path):
         ValueError, match=r"holds no photographs; at least 3 .*\. Not taken for photographs: .*\. To use"
     ):
         find_photos(tmp_path)
+
+
+def test_photographs_where_links_lead_are_found(tmp_path):
+    """Also where a link leads to a folder above it."""
+    random = np.random.default_rng(0)
+    for name in ("photos/0.png", "photos/a/1.png", "phone/2.png", "phone/b/3.png"):
+        save_blocks(tmp_path / name, 64, 48, random)
+    photos = tmp_path / "photos"
+    (photos / "linked").symlink_to(tmp_path / "phone")
+    (photos / "a" / "again").symlink_to(photos)
+    (photos / "broken").symlink_to(tmp_path / "nothing.png")
+    assert find_photos(photos) == ["0.png", "a/1.png", "linked/2.png", "linked/b/3.png"]
 
 
 def test_pictures_of_this_program_are_left_out_under_any_name(tmp_path):

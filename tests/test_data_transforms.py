@@ -514,6 +514,27 @@ def test_numbers_may_be_texts(tmp_path):
     assert load_scene(tmp_path).train[0].camera.width == WIDTH
 
 
+@no_points
+def test_the_angle_of_a_frame_replaces_the_focal_length_of_the_file(tmp_path):
+    frames = write_frames(tmp_path)
+    frames[1]["camera_angle_x"] = 2 * np.arctan(WIDTH / 2 / 70)
+    write_json(tmp_path, frames, **FOCAL, **SIZE)
+    views = load_scene(tmp_path, test_every=0).train
+    np.testing.assert_allclose(np.diag(views[1].camera.K), [70, 70, 1], rtol=1e-6)
+    assert views[0].camera.K[0, 0] == views[2].camera.K[0, 0] == FOCAL["fl_x"]
+
+
+@no_points
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le"])
+def test_encodings(tmp_path, encoding):
+    """As editors and shells of Windows write files."""
+    frames = write_frames(tmp_path)
+    write_json(tmp_path, frames, **FOCAL, **SIZE)
+    file = tmp_path / "transforms.json"
+    file.write_bytes(file.read_text().replace("\n", "\r\n").encode(encoding))
+    assert len(load_scene(tmp_path, test_every=0).train) == len(frames)
+
+
 @pytest.mark.parametrize(
     ("spoil", "error", "message"),
     [

@@ -203,6 +203,7 @@ def test_flags_of_edits_are_checked(options, message):
         ({"subject": 1}, "subject must be true or false; got 1"),
         ({"up": [0, 0, 0]}, "up must not be zero"),
         ({"background": [1, 2, None]}, "background must be 3 finite numbers"),
+        ({"background": [0, 0.5, 255]}, "background must be numbers from 0 to 1"),
         ({"crops": {}}, "has the unknown entry crops"),
     ],
 )

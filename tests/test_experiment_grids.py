@@ -282,7 +282,7 @@ def test_a_custom_system_needs_the_preset_of_the_scale(tmp_path, monkeypatch):
         ("[small]", "[small]\niterations = [60]", r"small.iterations must be list of 2 int \| None; got \[60\]"),
         ("[small]", "[small]\niterations = [60, -40]", "small.iterations must be at least 0; got -40"),
         ('system = "bytewise"', 'like = "A2TG"', "mine.toml: 'bytewise' is like 'A2TG', which is no method above it"),
-        ("budgets = [0.3]", "budgets = [0.3", "mine.toml: Unclosed array"),
+        ("budgets = [0.3]", "budgets = [0.3", "mine.toml: is not valid TOML: Unclosed array"),
     ],
 )
 def test_mistakes_in_a_grid_file_are_reported(tmp_path, before, after, words):

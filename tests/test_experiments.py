@@ -29,7 +29,7 @@ SMALL = {"sh_degree": 0, "loss": {"ssim_weight": 0.0}}
 
 
 def test_a_stage_stopped_under_one_system_continues_under_another(tmp_path, monkeypatch):
-    """From a checkpoint under the name that sweeps gave it before, and to the same model, bit for bit."""
+    """From a checkpoint whose time was not kept, and to the same model, bit for bit."""
     scene = a2tg.synthetic_scene(num_views=3, width=24, height=16, num_points=30)
     monkeypatch.setattr(Folders, "load_scene", lambda self, job: scene)
     plain = a2tg.find_system("gaussians-2d-mcmc").preset("smoke", **SMALL, stage1_iterations=4)
@@ -37,16 +37,16 @@ def test_a_stage_stopped_under_one_system_continues_under_another(tmp_path, monk
     job = Job("synthetic", 1, textured, 0)
     assert job.key == dataclasses.replace(job, system=plain).key
     folders = Folders(tmp_path, tmp_path)
-    former = tmp_path / "checkpoints" / f"{job.key}.npz"
-    stopped = lambda checkpoint: checkpoint.iteration == 2 and a2tg.save_checkpoint(former, checkpoint)  # noqa: E731
+    kept = folders.files.checkpoint(job.key, 2)
+    stopped = lambda checkpoint: checkpoint.iteration == 2 and a2tg.save_checkpoint(kept, checkpoint)  # noqa: E731
     whole = fit_stage(scene, plain, 0, on_checkpoint=stopped, checkpoint_every=2).model
     record = run_job(job, folders)
     assert record["training_seconds"] is None, "the time up to the checkpoint is not known"
     np.testing.assert_array_equal(a2tg.load_model(folders.model(job)).gaussians.means, whole.gaussians.means)
-    assert not [*former.parent.iterdir()]
+    assert not [*kept.parent.iterdir()]
     other = Job("synthetic", 1, dataclasses.replace(textured, seed=5), 0)
     fit_stage(scene, plain, 0, on_checkpoint=stopped, checkpoint_every=2)
-    former.replace(former.with_name(f"{other.key}.npz"))
+    kept.replace(folders.files.checkpoint(other.key, 2))
     with pytest.raises(ValueError, match="made with another seed"):
         run_job(other, folders)
 

@@ -9,7 +9,16 @@ import oracle
 import pytest
 from scenes_random import as_camera, as_gaussians, as_textures, draw_scene, draw_smooth_scene, quick_then_long
 
-from a2tg_jax import Appearance, Model, Renderer, RenderSettings, pytree, render_appearance, render_image
+from a2tg_jax import (
+    Appearance,
+    Model,
+    Renderer,
+    RenderSettings,
+    pytree,
+    render_appearance,
+    render_image,
+    view_gradients,
+)
 
 SCENE = draw_scene(4, num=8, width=11, height=9)
 SMOOTH = draw_smooth_scene(53, width=8, height=8)
@@ -83,9 +92,31 @@ def test_gradients_in_geometry_are_those_of_differences(channels):
     assert not jnp.any(gradient.sh) and jnp.all(jnp.any(gradient.means != 0, axis=1))
 
 
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("compositor", ["native", "xla"])
+def test_a_gradient_in_features_alone_is_the_same(compositor):
+    """Its backward pass computes nothing else."""
+    features = jnp.asarray(some_features(6, 3))
+    gaussians = as_gaussians(SMOOTH, "float64")
+    textures = as_textures(SMOOTH, "float64")
+    settings = RenderSettings(capacity=1024, compositor=compositor)
+    camera = as_camera(SMOOTH, "float64")
+
+    def loss(features, gaussians, textures):
+        output = render_image(gaussians, camera, textures, features=features, settings=settings)
+        return jnp.sum(output.color**2) + jnp.sum(output.depth)
+
+    alone = jax.jit(jax.grad(loss))
+    beside = jax.jit(jax.grad(loss, argnums=(0, 1)))
+    found = alone(features, gaussians, textures)
+    assert jnp.any(found)
+    np.testing.assert_allclose(found, beside(features, gaussians, textures)[0], rtol=1e-12, atol=1e-13)
+
+
 @pytest.mark.long
 @pytest.mark.usefixtures("gpu_kernels")
-def test_gpu_kernels_show_features():
+@pytest.mark.parametrize("argnums", [(0, 1), (0,)])
+def test_gpu_kernels_show_features(argnums):
     scene = draw_scene(4, num=4, width=8, height=8)
     gaussians = as_gaussians(scene, "float32")
     camera = as_camera(scene, "float32")
@@ -96,7 +127,7 @@ def test_gpu_kernels_show_features():
         output = render_image(gaussians, camera, features=features, settings=settings)
         return jnp.sum(output.color**2) + jnp.sum(output.depth)
 
-    found, wanted = (jax.grad(loss, argnums=(0, 1))(features, gaussians, name) for name in ("cuda", "xla"))
+    found, wanted = (jax.grad(loss, argnums)(features, gaussians, name) for name in ("cuda", "xla"))
     compare = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-3)
     jax.tree.map(compare, found, wanted)
 
@@ -138,6 +169,28 @@ def test_an_appearance_may_have_other_colours_than_three():
     shifted = Renderer(model, background=(0.5, 0.25))(camera)
     added = np.multiply.outer(1 - np.asarray(shifted.alpha), [0.5, 0.25])
     np.testing.assert_allclose(shifted.color - color, added, atol=1e-6)
+
+
+@pytest.mark.parametrize("background", [None, (0.5, 0.25)])
+def test_gradients_of_views_take_other_colours_than_three(background):
+    gaussians = as_gaussians(SCENE, "float32")
+    camera = as_camera(SCENE, "float32")
+    model = Model(gaussians, Two(), background=(1.0, 1.0, 1.0))
+    found = view_gradients(lambda _, output: jnp.mean(output.color), model, camera, background=background)
+    drawn = model.render(camera, background=background)
+    np.testing.assert_allclose(found.value, jnp.mean(drawn.color), rtol=1e-6)
+
+
+def test_a_background_of_traced_numbers():
+    """The image is linear in the background, with the transmittance as its factor."""
+    gaussians = as_gaussians(SCENE, "float32")
+    camera = as_camera(SCENE, "float32")
+
+    def total(red):
+        return jnp.sum(render_image(gaussians, camera, background=[red, 0.0, 0.0]).color)
+
+    transmittance = 1 - render_image(gaussians, camera).alpha
+    np.testing.assert_allclose(jax.grad(total)(0.5), jnp.sum(transmittance), rtol=1e-5)
 
 
 def test_mistakes_are_named():

@@ -8,6 +8,7 @@ import sys
 from types import SimpleNamespace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiled_programs import compiled_programs
@@ -35,7 +36,7 @@ from a2tg_jax.results.record import RunRecord, SceneSource
 from a2tg_jax.training import SYSTEMS, cost, fitting
 from a2tg_jax.training.cost import check_rows_fit, forecast_stages
 from a2tg_jax.training.loop import StageRun
-from a2tg_jax.training.reports import Pace, Progress, RestOfRun
+from a2tg_jax.training.reports import HALVED_WORK, Pace, Progress, RestOfRun, saved_work
 from a2tg_jax.training.start import initial_model
 from a2tg_jax.training.step import jitted_step
 
@@ -310,6 +311,14 @@ def test_a_later_stage_beyond_the_machine_is_refused_before_the_first(monkeypatc
     check_rows_fit(scene, system, 0, None, machine.Devices(1, 2))  # Other machines' memory is not known.
 
 
+def test_numbers_of_events_may_be_arrays():
+    system = a2tg.A2tg.preset("smoke")
+    fraction = jnp.asarray(system.texture.fraction)
+    of_array = dataclasses.replace(system, texture=dataclasses.replace(system.texture, fraction=fraction))
+    found = check_rows_fit(SMALL, of_array, 0, None, machine.Devices())
+    assert found == check_rows_fit(SMALL, system, 0, None, machine.Devices())
+
+
 def test_the_start_is_named_if_it_is_too_large(monkeypatch):
     monkeypatch.setattr(memory, "memory_limit", lambda: 10**6)
     system = a2tg.Gaussians2dMcmc.preset("smoke", densify=a2tg.Mcmc(cap=0))
@@ -453,6 +462,36 @@ def test_a_run_is_forecast_with_its_later_stages_and_its_evaluation():
     assert after[first].iterations == 1.5 * views + plan[last].stage.iterations and after[first].programs > 1.5
     _, textured = forecast_stages(scene, plan[last].system)
     assert after[first].model_bytes == textured.model_bytes
+
+
+def test_the_halved_photographs_of_a_comparison_count_as_the_work_that_they_are():
+    main, other = (a2tg.Gaussians2dMcmc.preset("quick", coarse_share=share) for share in (0.0, 0.5))
+    plan = plan_run({"main": main, "other": other})
+    last, first, _ = plan.names[1:]
+    stage = plan[first].stage
+    assert stage.num_coarse == stage.iterations // 2
+
+    def iterations_after(scene):
+        evaluation = time_after(scene, plan, [last])[last].iterations
+        return time_after(scene, plan, [last, first])[last].iterations - evaluation
+
+    large, small = scene_of(300, 200), scene_of(300, 100)
+    assert iterations_after(large) == pytest.approx(stage.iterations - (1 - HALVED_WORK) * stage.num_coarse)
+    assert iterations_after(small) == stage.iterations, "photographs of less than 128 rows are not halved"
+    programs = [next(iter(forecast_stages(scene, other))).num_programs for scene in (large, small)]
+    assert programs[0] == programs[1] + 1
+
+
+def test_the_pace_counts_every_view_that_is_halved():
+    """Not only the first one, which may be the one that is too small."""
+    views = (scene_of(300, 100).train[0], *scene_of(300, 200).train[1:])
+    saved = saved_work(views)
+    assert saved == pytest.approx((1 - HALVED_WORK) * (len(views) - 1) / len(views))
+    pace = pace_of([0.0, 10.0], num_coarse=500, saved=saved)
+    for done in (0, 100):
+        pace.time(done, 1)
+    work = (500 - 100) * (1 - saved) + 500
+    assert pace.left(100).total_seconds() == round(10 * work / (100 * (1 - saved)))
 
 
 def test_the_end_of_a_run_is_no_longer_than_it_was_measured():

@@ -418,6 +418,7 @@ CHANGES = [
     (lambda d: d["buffers"][0].update(uri="https://a.b/c.bin"), "is not in the folder"),
     (lambda d: d["buffers"][0].update(uri="é" * 200), "too long a name"),
     (lambda d: d["buffers"][0].update(uri="data:;base64,???"), "embedded buffer is damaged"),
+    (lambda d: d["buffers"][0].update(uri="data:text/plain,%00"), "buffer is not base64"),
     (lambda d: d.update(extensionsRequired=["KHR_draco_mesh_compression"]), "needs the extension KHR_d"),
     (lambda d: d["asset"].update(version="1.0"), "glTF of version 1.0"),
     (lambda d: d["nodes"][0].update(children=[0]), "occurs twice"),

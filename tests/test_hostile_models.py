@@ -95,7 +95,7 @@ def test_models_with_numbers_that_are_not_finite_or_too_large(tmp_path, name):
         (lambda _, a: a.update({name: a[name].astype(np.float16) for name in GAUSSIANS}), "must be float32 or float64"),
         (with_array("appearance/texels", lambda x: x.astype(np.float16)), "must be floats, float32 or float64"),
         (with_array("quats", lambda x: x[1:]), r"quats must be \[12, 4\]"),
-        (with_array("appearance/sizes", lambda x: x + 400), "sizes must be integers"),
+        (with_array("appearance/sizes", lambda x: x + 400), "texture sides must be in 1"),
         (with_number("origin/Ks", np.nan), r"camera a\.png: its focal lengths"),
         (with_number("origin/Ks", 1e30), r"camera a\.png: its focal lengths"),
         (with_number("origin/Ks", np.inf, 2), r"camera a\.png: its principal point"),

@@ -13,6 +13,7 @@ from PIL import Image
 
 from a2tg_jax.data import decoding
 from a2tg_jax.data.decoding import MAX_PIXELS, picture_facts, read_pixels
+from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.images import picture_names, save_picture
 
 CHANNELS = {0: 1, 2: 3, 4: 2, 6: 4}
@@ -173,6 +174,18 @@ def test_results_never_share_a_file():
     assert found["d/e/f.png"] == "d_e_f.png" and found["c.jpg"] == "c.png" and found["c.png"] == "c-2.png"
     assert found == picture_names(reversed(names))
     assert not any("/" in name for name in found.values())
+
+
+def test_results_have_names_of_one_line(tmp_path):
+    """A run's marker lists its files by lines: the second line of a name would be a file of the user's."""
+    run = RunFolder(tmp_path)
+    mine = tmp_path / "notes.png"
+    mine.touch()
+    for name in picture_names(["day/a\nnotes.png", "b\u2028c.png"]).values():
+        save_picture(run.own(run.test / name), np.zeros((2, 2, 3), np.uint8))
+    assert len(run.files()) == 2
+    run.clear()
+    assert mine.is_file() and not run.test.exists()
 
 
 def test_results_of_photographs_with_long_names_are_files(tmp_path):

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import jax
 import numpy as np
+import pytest
 from small_files import taken_apart
 from small_models import billboards, with_row
 from test_compact import plain, textured
@@ -87,6 +88,17 @@ def test_snapshots_and_figures():
     live(run, lambda: False)
     encoded(live)
     assert status(live)["version"] == 2
+
+
+def test_the_infinite_psnr_of_equal_pictures_is_told():
+    """Browsers do not parse Infinity, and would take the training for ended."""
+    live = LiveView(SCENE, "scene", Clock())
+    run = stage_run()
+    run.history = with_row(History.empty(), 1, 20, 0.5, np.inf, 40, 1.25, 3.0)
+    live(run, lambda: False)
+    encoded(live)
+    found = json.loads(live.routes["/training.json"].read(), parse_constant=pytest.fail)
+    assert (found["iteration"], found["psnr"]) == (20, None)
 
 
 def test_slow_snapshots_are_rare():

@@ -118,7 +118,15 @@ def test_a_scene_becomes_a_page_by_printed_commands_and_the_same_command_continu
     assert re.findall(r"^\$ a2tg (\w+)", printed, flags=re.MULTILINE) == ["export", "render", "render"]
     assert f"\n$ cp {tmp_path / 'out/flight/front.png'} {tmp_path / 'out/toy.png'}\n" in printed
 
-    # Another photograph is not in the run.
+    # Other cameras are not in the run, nor another photograph.
+    cameras = tmp_path / "toy/transforms.json"
+    before = cameras.read_text()
+    cameras.write_text(before.replace('"w": 64', '"w": 63'))
+    assert cli.main(words) == 2
+    assert f"cameras changed since {tmp_path / 'out'} was made from them: 1 changed (toy/transforms.json)" in (
+        capsys.readouterr().err
+    )
+    cameras.write_text(before)
     (tmp_path / "toy/images/7.png").touch()
     assert cli.main(words) == 2 and "1 new (toy/images/7.png)" in capsys.readouterr().err
 
@@ -140,7 +148,7 @@ def is_answered(capsys, words, *parts):
 def test_photographs_that_changed_since_the_scene_was_made_are_noticed(tmp_path, monkeypatch, capsys):
     steps = []
 
-    def find_cameras(name, words):
+    def find_cameras(name, words, run):
         steps.append(name)
         if len(steps) == 1:
             raise ValueError("no cameras are found")
@@ -193,6 +201,34 @@ def test_photographs_that_changed_since_the_scene_was_made_are_noticed(tmp_path,
     is_answered(capsys, [photos, "stitch", "--out", "out"], "1 new (stitch/0.jpg)")
     is_answered(capsys, [photos, "stich", "--out", "out"], "stich: no such file or folder")
     is_answered(capsys, [photos, "--out", "other"], "enough")
+
+
+def test_cameras_that_changed_since_a_scene_was_trained_are_noticed(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("a2tg_jax.results.minutes.choose_training", raising(ValueError("the training is chosen")))
+    write_scene(Path("toy"))
+    is_answered(capsys, ["toy"], "the training is chosen")
+    Path("runs/toy/run").mkdir()
+    Path("runs/toy/run/run.toml").touch()
+    cameras = Path("toy/transforms.json")
+    before = cameras.read_text()
+    cameras.write_text(before.replace('"w": 64', '"w": 63'))
+    is_answered(
+        capsys, ["./toy"], "the cameras changed since runs/toy was made from them: 1 changed (toy/transforms.json);"
+    )
+    cameras.write_text(before)
+    (tmp_path / "toy/transforms (1).json").write_text(before)
+    is_answered(capsys, [tmp_path / "toy"], "1 new (toy/transforms (1).json)")
+    Path("runs/toy/.a2tg-cameras.json").unlink()  # An earlier version made it.
+    is_answered(capsys, ["toy"], "run.toml")
+
+
+def test_a_folder_with_a_dot_gives_its_whole_name(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(make, "run_step", raising(ValueError("enough")))
+    Path("fox.v2").mkdir()
+    is_answered(capsys, ["fox.v2"], "enough")
+    assert Path("runs/fox.v2").is_dir()
 
 
 def test_another_video_is_noticed(tmp_path, monkeypatch, capsys):

@@ -178,18 +178,25 @@ def test_growth_copies_hosts_into_new_rows_with_zero_moments():
 
 def test_bad_arguments_are_named():
     gaussians = random_gaussians(8)
-    with pytest.raises(ValueError, match="cap must be at most the 8 rows"):
-        grow(KEY, gaussians, (), 4, 9)
+    for cap in (-1, 9, 7.5):
+        with pytest.raises(ValueError, match=rf"cap must be a whole number in 0\.\.8; got {cap}"):
+            grow(KEY, gaussians, (), 4, cap)
     for step in (relocate, functools.partial(grow, cap=8)):
         with pytest.raises(ValueError, match=r"adam_init\(gaussians\), or arrays with 8 rows; got moments\['count'\]"):
             step(KEY, gaussians, {"count": jnp.zeros(())}, 4)
         with pytest.raises(ValueError, match=r"got moments\[0\].means of shape \[9, 3\]"):
             step(KEY, gaussians, adam_init(random_gaussians(9)), 4)
         for num_live in (-1, 9, 4.5):
-            with pytest.raises(ValueError, match=f"num_live must be an int, 0 to 8; got {num_live}"):
+            with pytest.raises(ValueError, match=rf"num_live must be a whole number in 0\.\.8; got {num_live}"):
                 step(KEY, gaussians, (), num_live)
     with pytest.raises(ValueError, match=r"scales must be \[8, 2\]; got \[3\]"):
         perturb(KEY, gaussians, 8, 1e-4, jnp.ones(3))
+
+
+def test_noise_takes_scales_in_lists():
+    gaussians = random_gaussians(8)
+    noisy = perturb(KEY, gaussians, 8, 1e-4, np.asarray(gaussians.scales).tolist())
+    np.testing.assert_array_equal(noisy.means, perturb(KEY, gaussians, 8, 1e-4).means)
 
 
 @pytest.mark.parametrize("step", [relocate, lambda *args: grow(*args, NUM)], ids=["relocate", "grow"])

@@ -427,6 +427,25 @@ def test_a_simplified_mesh_is_not_empty(sphere, monkeypatch):
         a2tg.simplify_mesh(sphere, 4)
 
 
+def test_simplifying_keeps_map_coordinates(sphere, monkeypatch):
+    """The library takes float32, which has steps of half a metre there."""
+    given = []
+
+    def simplify(vertices, faces, target_reduction):
+        given.append(vertices)
+        return np.asarray(vertices, np.float64), np.asarray(faces)
+
+    monkeypatch.setitem(sys.modules, "fast_simplification", types.SimpleNamespace(simplify=simplify))
+    offset = np.array([431_235.0, 5_411_222.0, 312.0])
+    far = a2tg.Mesh(np.asarray(sphere.vertices, np.float64) + offset, sphere.faces)
+    simple = a2tg.simplify_mesh(far, 100)
+    assert given[0].dtype == np.float32
+    np.testing.assert_allclose(simple.corners, far.corners, rtol=0, atol=1e-6)
+    # Near the origin, the library gets the numbers as they are.
+    a2tg.simplify_mesh(sphere, 100)
+    np.testing.assert_array_equal(given[1], sphere.vertices)
+
+
 # Textures
 
 

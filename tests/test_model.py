@@ -200,7 +200,7 @@ def test_files_that_are_damaged_are_one_error_that_names_them(tmp_path, spoil, m
         (lambda _, arrays: arrays.pop("appearance/texels"), "the array texels of the appearance is missing"),
         (with_array("appearance/texels", lambda x: x[1:]), "disagree"),
         (with_array("appearance/texels", lambda x: x.astype(np.int32)), "must be floats"),
-        (with_array("appearance/sizes", lambda x: -x), r"sizes must be integers \[N, 2\] in 0\.\.16"),
+        (with_array("appearance/sizes", lambda x: -x), r"sizes: texture sides must be in 1\.\.16, or both 0"),
         (with_array("appearance/sizes", lambda x: x.astype(float)), "sizes must be integers"),
         (with_array("appearance/sizes", lambda x: x.ravel()), "sizes must be integers"),
         (

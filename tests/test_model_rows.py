@@ -113,6 +113,14 @@ def test_models_are_joined(name):
     assert_rows(concatenate(halves), rows_of(first))
 
 
+@pytest.mark.parametrize("template", [billboards(), movable_kernels()], ids=lambda template: type(template).__name__)
+def test_an_appearance_of_no_gaussians(template):
+    none = as_gaussians(draw_scene(0), "float32")[:0]
+    appearance = allocate_appearance(template, jax.random.key(0), none)
+    check_model(Model(none, appearance))
+    assert Model(none, appearance).num_bytes == 0
+
+
 def test_lower_degrees_are_filled_up():
     first = some_model("plain")
     second = some_model("plain", seed=3)

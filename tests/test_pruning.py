@@ -113,6 +113,7 @@ def test_impossible_numbers_are_refused_before_training():
     for event, message in (
         (Prune(share=1.0), r"Prune\.share must be at least 0 and below 1; got 1.0$"),
         (Prune(share=-0.1), r"Prune\.share must be"),
+        (Prune(keep=40.0), r"Prune\.keep must be int \| None; got 40\.0$"),
         (Prune(keep=1), r"Prune\.keep must be at least 2; got 1$"),
     ):
         with pytest.raises(ValueError, match=message):

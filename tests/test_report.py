@@ -280,6 +280,11 @@ def test_maps_show_what_varies_between_gaussians(figures_of):
             assert [*meanings] == names and len(set(colors)) == len(names)
 
 
+def test_textures_of_a_fixed_size_are_counted():
+    texts = [text.get_text() for text in figures.sizes_figure(np.array([[3, 3]] * 3 + [[4, 1]])).axes[0].texts]
+    assert sorted(texts)[:2] == ["1\n25.0%", "3\n75.0%"] and set(texts[2:]) - set(sorted(texts)[:2]) == {"–"}
+
+
 def test_figures_are_drawn_within_their_canvas(figures_of, tmp_path):
     made = figures_of(some_model())
     for name in ("curves.png", "sizes.png"):

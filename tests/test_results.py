@@ -44,6 +44,7 @@ from a2tg_jax import (
 from a2tg_jax.base.text import in_bytes
 from a2tg_jax.cli import main as cli
 from a2tg_jax.measure import evaluation
+from a2tg_jax.results import info
 from a2tg_jax.results.commands import repeating_command
 from a2tg_jax.results.folder import OLD, RunFolder, check_free, drop_old, open_run, set_aside
 from a2tg_jax.results.history import EventWriter, read_history, write_history
@@ -225,6 +226,21 @@ def test_info_of_a_folder_lists_its_runs(tmp_path, capsys):
     assert cli.main(["info", str(tmp_path), "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert "is not valid TOML" in facts[0]["damage"] and facts[1]["damage"] is None
+
+
+def test_info_of_a_folder_lists_runs_that_may_not_be_read(tmp_path, capsys, monkeypatch):
+    """Runs of other users, and files that a training replaces meanwhile."""
+    runs = [with_record(tmp_path / name, RunRecord(SceneSource("synthetic"), "a2tg", A2tg())) for name in "ab"]
+
+    def read(run):
+        if run.path.name == "a":
+            raise PermissionError(13, "Permission denied", str(run.record))
+        return read_record(run)
+
+    monkeypatch.setattr(info, "read_record", read)
+    assert cli.main(["info", str(tmp_path)]) == 0
+    denied, begun = capsys.readouterr().out.splitlines()
+    assert "Permission denied" in denied and str(runs[0].record) in denied and begun.endswith("not begun")
 
 
 def test_info_of_a_folder_has_the_progress_of_begun_runs_and_those_of_make(tmp_path, capsys):
@@ -442,7 +458,7 @@ def test_a_configuration_file_may_be_partial_and_its_paths_start_from_its_folder
         ("gaussians-2d", Gaussians2d(seed=5), ("gaussians-2d-mcmc",), None),
     ],
 )  # fmt: skip
-def test_command_repeats_the_run(tmp_path, name, system, compare, preset):
+def test_command_repeats_the_run(tmp_path, monkeypatch, name, system, compare, preset):
     """run.toml holds every number, so other defaults, or a preset, change nothing; None where a preset has a value."""
     record = RunRecord(SceneSource(str(tmp_path / "a b"), downscale=4), name, system, compare, preset)
     run = with_record(tmp_path / "run c", record)
@@ -451,6 +467,10 @@ def test_command_repeats_the_run(tmp_path, name, system, compare, preset):
     program, command, *arguments = shlex.split(repeating_command(run))
     again = cli.parsed(command, arguments)
     assert (program, again.record, again.out) == ("a2tg", record, tmp_path / "run c-again")
+    (run.path / "below").mkdir()
+    for folder, place in ((run.path, "."), (run.path / "below", "..")):
+        monkeypatch.chdir(folder)
+        assert shlex.split(repeating_command(RunFolder(Path(place))))[-1] == str(tmp_path / "run c-again")
     assert again.record.systems == record.systems
 
 
@@ -511,7 +531,7 @@ def test_shared_stages_are_trained_once():
 def test_stages_that_differ_are_not_shared():
     changes = {
         "seed": 1, "batch_size": 2, "initial_opacity": 0.2, "background": "white", "stage1_iterations": 7,
-        "rates": LearningRates(sh_rest=1.0), "densify": Mcmc(cap=9),
+        "rates": LearningRates(sh_rest=1.0), "densify": Mcmc(cap=9), "coarse_share": 0.5,
     }  # fmt: skip
     assert len(plan_run({"a": A2tg(), "b": A2tg()}).stages) == 2
     for name, value in changes.items():

@@ -20,6 +20,7 @@ from test_others import NUM, OTHERS, check, match, numbers, scene
 from a2tg_jax import Gaussians, Model, load_splats, save_splats
 from a2tg_jax.cli.main import main
 from a2tg_jax.io import sog
+from a2tg_jax.io.formats import files_of
 
 SCENE = OTHERS / "scene.sog"
 PICTURES = (
@@ -70,11 +71,14 @@ def test_a_folder_its_header_and_a_zipped_folder_are_read(tmp_path, capsys):
     assert main(["convert", str(tmp_path / "b.npz"), str(folder / "meta.json"), "--overwrite"]) == 2
     assert "unbundled SOG can be read, but not written; write *.sog" in capsys.readouterr().err
     (folder / "quats.webp").unlink()
+    assert len(files_of(folder / "meta.json")) == len(entries())
     with pytest.raises(ValueError, match=r"meta\.json: the picture quats\.webp, which it names, is missing in"):
         load_splats(folder)
     (tmp_path / "a.sog").write_bytes(zipped({**inside, **{f"other/{name}": data for name, data in entries().items()}}))
     with pytest.raises(ValueError, match=r"a\.sog: holds several scenes \(scene/meta\.json, other/meta\.json\)"):
         load_splats(tmp_path / "a.sog")
+    (folder / "meta.json").write_text("[]")
+    assert files_of(folder / "meta.json") == [folder / "meta.json"]
 
 
 def test_a_folder_zipped_with_backslashes_is_read(tmp_path):

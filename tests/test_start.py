@@ -93,3 +93,29 @@ def test_points_that_no_view_sees_are_refused():
     lost = dataclasses.replace(scene, points=scene.points + np.float32([0, 0, 1000]))
     with pytest.raises(ValueError, match=r"scene\.points: no training view sees any of the 50 points: .*transform"):
         a2tg.fit(lost, a2tg.Gaussians2dMcmc(stage1_iterations=1))
+
+
+def test_rows_of_given_textures_may_be_in_any_order():
+    """Textures that are equal but for the rows of their bucket train to the same model, while Gaussians are added."""
+
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Grows(a2tg.System):
+        def stages(self):
+            appearance = a2tg.Appearance(texture=a2tg.Texture(start=(2, 2)))
+            return (a2tg.Stage("grow", appearance, (a2tg.Mcmc(cap=30),), self.loss.terms(), self.rates, 12, 1e-2),)
+
+    scene = a2tg.synthetic_scene(num_views=3, width=16, height=16, num_points=20)
+    gaussians = a2tg.init_from_points(scene.points, scene.colors, sh_degree=0)
+    rng = np.random.default_rng(0)
+    ordered = a2tg.textures_from_arrays(list(rng.random((20, 2, 2, 4), np.float32)))
+    rows = rng.permutation(20).astype(np.int32)
+    bucket = np.array(ordered.buckets[0])
+    bucket[rows] = ordered.buckets[0][:20]
+    shuffled = dataclasses.replace(ordered, buckets=(jnp.asarray(bucket),), row=jnp.asarray(rows))
+    images = []
+    for textures in (ordered, shuffled):
+        model = a2tg.Model(gaussians, a2tg.Appearance(texture=a2tg.Texture(textures, start=(2, 2))))
+        trained = a2tg.fit(scene, Grows(sh_degree=0, loss=a2tg.LossConfig(ssim_weight=0.0)), start=model).model
+        assert trained.num > 20
+        images.append(trained.render(scene.train[0].camera).color)
+    np.testing.assert_array_equal(*images)

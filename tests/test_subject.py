@@ -271,6 +271,13 @@ def test_an_orbit_shows_the_whole_subject_though_photographs_look_at_its_foot():
     upright = [widen_camera(camera, 60, 120) for camera in orbit]
     for unchanged, model_of in ((upright, model), (orbit, looking(model, []))):
         np.testing.assert_array_equal(with_whole_subject(unchanged, model_of)[0].K, unchanged[0].K)
+    # Of photographs cut from larger ones, the optical axis may be at the border, or beyond it.
+    for cx in (2.0, -30.0, 158.0):
+        cut = [dataclasses.replace(camera, K=camera.K.at[0, 2].set(cx)) for camera in orbit]
+        found = with_whole_subject(cut, model)
+        assert float(found[0].K[0, 0]) > 0
+        assert reach(found) == pytest.approx(0.9, abs=0.02)
+    np.testing.assert_array_equal(with_whole_subject(cut, looking(model, []))[0].K, cut[0].K)
 
 
 SIZE = (160, 120)
@@ -365,6 +372,37 @@ def test_training_reads_the_masks_of_the_subject(tmp_path, capsys, distortion):
     save_edit(tmp_path / "edit.json", Edit(background=(1.0, 1.0, 1.0)))
     assert main([*words, "--overwrite", "--edit", str(tmp_path / "edit.json")]) == 0
     assert "what the edit keeps covers 100 % of the photographs" in capsys.readouterr().out
+
+
+def test_masks_that_training_would_not_read_are_refused(tmp_path, capsys):
+    splats = Splats(0)
+    splats.add_object(np.zeros(3))
+    splats.add_floor()
+    cameras = around([0, 0, 0.25])
+    scene = tmp_path / "scene"
+    write_photographs(scene, cameras, 0.0)
+    transforms = scene / "transforms.json"
+    own = transforms.read_text()
+
+    def error_of(number):
+        source = SceneSource(str(scene), downscale=8)
+        loaded = source.load()
+        model = dataclasses.replace(splats.model(cameras).transform(loaded.transform), origin=loaded.origin)
+        run = write_run(tmp_path / f"run{number}", source, model)
+        assert main(["mask", str(run.path), "--out", str(scene / "masks")]) == 2
+        assert not (scene / "masks").exists()
+        return capsys.readouterr().err
+
+    # Blender's layout, with photographs next to the file of the cameras or in a folder of another name.
+    (scene / "images").rename(scene / "train")
+    transforms.write_text(own.replace("images/", "train/"))
+    assert "masks of photographs in the folder images only, and train/day/00.jpg is elsewhere: move" in error_of(0)
+    # The scene names other masks.
+    (scene / "train").rename(scene / "images")
+    (scene / "own").mkdir()
+    Image.new("L", SIZE, 255).save(scene / "own" / "a.png")
+    transforms.write_text(own.replace("{", '{"mask_path": "own/a.png", ', 1))
+    assert "names masks by mask_path, which training reads instead" in error_of(1)
 
 
 def test_masks_need_a_subject_and_a_scene_that_reads_them(tmp_path, capsys):

@@ -288,7 +288,7 @@ def test_wrong_arguments_of_fit_are_refused(scene, trained):
         fit(scene, dataclasses.replace(CONFIG, seed=4), resume=checkpoint)
     with pytest.raises(ValueError, match=r"another configuration \(A2tg, not Gaussians2dMcmc\)"):
         fit(scene, Gaussians2dMcmc(stage1_iterations=4), resume=checkpoint)
-    with pytest.raises(ValueError, match="checkpoint_every must be at least 1; got 0"):
+    with pytest.raises(ValueError, match="checkpoint_every must be an int, at least 1; got 0"):
         fit(scene, CONFIG, checkpoint_every=0)
     with pytest.raises(
         ValueError, match=r"^progress must be None, or a class such as a2tg_jax\.ProgressBar; got True$"

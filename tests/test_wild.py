@@ -231,6 +231,17 @@ class TestDepthFiles:
         np.testing.assert_allclose(read_depths(find_depths(images, "y.jpg")), values, atol=1e-4)
         assert find_depths(images, "z.jpg") is None
 
+    def test_capitals_and_either_byte_order(self, tmp_path):
+        levels = (1000 * np.arange(24)).reshape(4, 6)
+        np.save(tmp_path / "x.npy", levels / 65535)
+        (tmp_path / "x.npy").rename(tmp_path / "x.NPY")
+        Image.frombytes("I;16B", (6, 4), levels.astype(">u2").tobytes()).save(tmp_path / "x.tif")
+        for name in ("x.NPY", "x.tif"):
+            np.testing.assert_allclose(read_depths(tmp_path / name), levels / 65535, rtol=1e-6)
+        Image.fromarray(levels.astype(np.int32) << 16).save(tmp_path / "deep.tif")
+        with pytest.raises(ValueError, match=r"deep\.tif: must be greyscale, of 8 or 16 bits; its mode is I"):
+            read_depths(tmp_path / "deep.tif")
+
     def test_they_are_undistorted_and_resized_with_their_photographs(self, tmp_path):
         """A step in a map of twice the size is where the step in the photograph's undistorted mask is."""
         write_scene(tmp_path, models=("OPENCV_FISHEYE",), num_views=3)

@@ -1,6 +1,6 @@
 """What the viewer's own tests read: a small scene with its numbers, and scenes with pictures of the JAX renderer.
 
-    python tests/viewer_cases.py small web/test        # web/test/small.a2tgz and small.json, which are committed
+    python tests/viewer_cases.py small web/test        # small.a2tgz, small.json and plain.a2tgz, which are committed
 
 `write_case` writes a folder that web/browser/compare.test.ts compares the page with.
 """
@@ -11,6 +11,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from small_files import model_in
@@ -63,11 +64,24 @@ def shaped_model() -> Model:
     return dataclasses.replace(model, appearance=dataclasses.replace(model.appearance, exponents=exponents))
 
 
+def plain_model() -> Model:
+    """Forty of these Gaussians without textures, before three cameras."""
+    model = small_model()
+    cameras = []
+    for distance in (4.0, 5.0, 6.0):
+        viewmat = np.eye(4)
+        viewmat[2, 3] = distance
+        cameras.append(dataclasses.replace(model.origin.cameras[0], viewmat=viewmat))
+    origin = Origin.of_cameras(cameras, ["a.png", "b.png", "c.png"])
+    return Model(jax.tree.map(lambda x: x[:40], model.gaussians), origin=origin)
+
+
 def write_small(folder: Path) -> None:
     """A scene's file, and what is in it."""
     source = Source(small_model(), "small", "a note")
     (folder / "small.a2tgz").write_bytes(source.encoded)
     (folder / "small.json").write_text(json.dumps(small_numbers(source.model)) + "\n")
+    (folder / "plain.a2tgz").write_bytes(Source(plain_model(), "plain").encoded)
 
 
 def small_numbers(model: Model) -> dict[str, list]:

@@ -107,9 +107,11 @@ class Billboards(Appearance):
         along = np.exp(-0.5 * (np.linspace(-1, 1, self.side) / INITIAL_SIGMA) ** 2)
         picture = np.full((self.side, self.side, 4), np.log(self.initial_rgb / (1 - self.initial_rgb)))
         picture[..., 3] = INITIAL_PEAK * np.outer(along, along)
-        (bucket,) = pictures.buckets
-        filled = jnp.broadcast_to(jnp.asarray(picture, bucket.dtype)[None], bucket.shape)
-        return dataclasses.replace(self, pictures=dataclasses.replace(pictures, buckets=(filled,)))
+        if gaussians.num:
+            (bucket,) = pictures.buckets
+            filled = jnp.broadcast_to(jnp.asarray(picture, bucket.dtype)[None], bucket.shape)
+            pictures = dataclasses.replace(pictures, buckets=(filled,))
+        return dataclasses.replace(self, pictures=pictures)
 
     def project(self) -> "Billboards":
         """Return pictures with alpha clamped to [0, the upper limit]: above it nothing would ever fade again."""

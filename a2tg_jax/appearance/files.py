@@ -29,7 +29,7 @@ from a2tg_jax.core.gaussians import no_rows
 from a2tg_jax.core.pytree import is_shared
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.table import Table, is_table, is_whole
-from a2tg_jax.texture import MAX_SIDE, Textures
+from a2tg_jax.texture import Textures, checked_sizes
 
 OLD_INNER = "inner."
 """Prefix of the arrays of a wrapped appearance in files of version 0.2."""
@@ -109,14 +109,11 @@ def _array(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
 
 
 def _textures(arrays: Mapping[str, np.ndarray], sizes_name: str, texels_name: str) -> Textures:
-    sizes = _array(arrays, sizes_name)
+    sizes = checked_sizes(_array(arrays, sizes_name), sizes_name)
     texels = _array(arrays, texels_name)
-    is_size = sizes.ndim == 2 and sizes.shape[1] == 2 and np.issubdtype(sizes.dtype, np.integer)
-    if not is_size or (sizes.size and not 0 <= sizes.min() <= sizes.max() <= MAX_SIDE):
-        raise ValueError(f"{sizes_name} must be integers [N, 2] in 0..{MAX_SIDE}; got {sizes.dtype} {sizes.shape}")
     if texels.shape != (int(np.prod(sizes, axis=1).sum()), 4):
         raise ValueError(f"{sizes_name} [N, 2] and {texels_name} [M, 4] disagree; got {sizes.shape} and {texels.shape}")
-    return Textures.of_flat(sizes.astype(np.int64), texels)
+    return Textures.of_flat(sizes, texels)
 
 
 def _coefficients(arrays: Mapping[str, np.ndarray], sh_degree: int) -> Coefficients:

@@ -15,7 +15,8 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike, DTypeLike
 
-from a2tg_jax.base.checks import check_literals, check_number, check_shape
+from a2tg_jax.base.checks import check_number, check_shape
+from a2tg_jax.base.config_json import check_config
 from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.gaussians import LARGEST_OPACITY, Gaussians, logit
@@ -89,7 +90,7 @@ class TextureOptions(NamedFields):
 
     def __post_init__(self) -> None:
         """Check the conventions and the extent."""
-        check_literals(self)
+        check_config(self)
         check_number("extent", self.extent, least=LEAST_EXTENT, most=MOST_EXTENT)
 
     def check_options(self) -> None:

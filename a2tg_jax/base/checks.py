@@ -9,7 +9,7 @@ import dataclasses
 import math
 import numbers
 from collections.abc import Iterable, Iterator
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, get_args
 
 import jax
 import jax.numpy as jnp
@@ -65,13 +65,6 @@ def check_literal(name: str, value: object, literal: object) -> None:
     """Raise ValueError unless a value is one of a `Literal`."""
     if value not in get_args(literal):
         raise ValueError(f"{name} must be one of {', '.join(get_args(literal))}; got {value!r}")
-
-
-def check_literals(instance: object) -> None:
-    """Raise ValueError, naming the field, unless fields of a dataclass that are a `Literal` have one of its values."""
-    for name, hint in get_type_hints(type(instance)).items():
-        if get_origin(hint) is Literal:
-            check_literal(name, getattr(instance, name), hint)
 
 
 def check_int(name: str, value: Any, least: int, most: int | None = None, otherwise: str = "") -> None:

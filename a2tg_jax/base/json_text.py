@@ -32,7 +32,7 @@ def parse_json(text: str | bytes, *, allow_nan: bool = False) -> Any:
     """Return the value of a JSON text.
 
     Args:
-      text: the text, or UTF-8.
+      text: the text, or its bytes in UTF-8, UTF-16 or UTF-32.
       allow_nan: whether to accept floats that overflow, NaN and infinities, which are not JSON but which Python's own
         library writes.
 
@@ -58,8 +58,8 @@ def parse_json(text: str | bytes, *, allow_nan: bool = False) -> Any:
             raise ValueError(f"a number of {len(digits)} digits is too large")
         return int(digits)
 
-    text = data.decode("utf-8-sig", "surrogatepass")  # json rejects a byte order mark.
-    return _parsed(lambda: json.loads(text, parse_constant=number, parse_int=integer, parse_float=number))
+    # Of bytes, json detects the encoding, and skips a byte order mark.
+    return _parsed(lambda: json.loads(data, parse_constant=number, parse_int=integer, parse_float=number))
 
 
 def read_json(file: Path, *, allow_nan: bool = True) -> Any:
@@ -117,6 +117,14 @@ def parse_toml(data: bytes) -> dict[str, Any]:
     return _parsed(lambda: tomllib.loads(data.decode("utf-8")))
 
 
+def read_toml(file: Path) -> dict[str, Any]:
+    """Return the table in a TOML file. Raises as `read_regular`, and ValueError, naming the file, if it is not TOML."""
+    try:
+        return parse_toml(read_regular(file, MOST_TOML_BYTES))
+    except ValueError as error:
+        raise ValueError(f"{file}: is not valid TOML: {shortened(str(error), 200)}") from error
+
+
 def _check_size(data: bytes, most: int) -> None:
     if len(data) > most:
         raise ValueError(f"it has {len(data):,} bytes; the limit is {most:,}")
@@ -166,3 +174,18 @@ def number_array(values: object, count: int | None, name: str, *, null: float | 
         wanted = f"{count or 'a list of'} finite numbers{'' if null is None else ' or null'}"
         raise ValueError(f"{name} must be {wanted}; got {shortened(values)}")
     return np.array([null if value is None else value for value in values], np.float64)
+
+
+def number_rows(values: object, width: int, name: str) -> np.ndarray:
+    """Return lists of numbers in JSON, or of texts of numbers, as float64 [N, width].
+
+    Raises:
+      ValueError: with the name, if they are anything else, or a number is not finite.
+    """
+    try:
+        rows = np.asarray(values, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        rows = np.empty(0)
+    if rows.ndim != 2 or rows.shape[1] != width or not np.isfinite(rows).all():
+        raise ValueError(f"{name} must be rows of {width} finite numbers; got {shortened(values)}")
+    return rows

@@ -58,7 +58,7 @@ def megabytes_of(budget: float | str | None, name: str = "memory_budget") -> flo
         number, unit = match.groups() if match else ("", "")
         # As floats, 33.3 kB would be 0.033299999999999996 MB, in messages as well.
         megabytes = float(decimal.Decimal(number) * decimal.Decimal(MEGABYTES[unit]))
-    except (KeyError, decimal.InvalidOperation):
+    except (KeyError, decimal.DecimalException):
         raise ValueError(
             f"{name} must be a number of MB (10^6 bytes), or one with a unit, such as 1.5MB, 800kB or 2GB; "
             f"got {shortened(budget)}"

@@ -35,6 +35,7 @@ FLAGS: dict[type, Mapping[str, tuple[Any, ...]]] = {}
 
 
 SCENE_IS_MISSING = "SCENE is missing: a folder, or built in, synthetic or cells: a2tg train SCENE --out RUN"
+RESUMES_OR_REPLACES = "--resume continues a run and --overwrite replaces it: give one of them"
 print_now = functools.partial(print, flush=True)
 """Print a line that is read while the program works."""
 
@@ -107,7 +108,7 @@ class DecidingOptions:
     @property
     def takes_run(self) -> bool:
         """Whether the defaults are the options of the run to resume."""
-        return bool(self.out) and self.resume and not self.overwrite
+        return bool(self.out) and self.resume
 
 
 def deciding_options(arguments: Sequence[str]) -> DecidingOptions:
@@ -121,6 +122,8 @@ def deciding_options(arguments: Sequence[str]) -> DecidingOptions:
     given, _ = tyro.cli(DecidingOptions, prog="a2tg train", args=arguments, return_unknown_args=True, add_help=False)
     for path in (given.config, given.out):
         expanded(path)  # Raises ValueError for a URL.
+    if given.resume and given.overwrite:
+        raise ValueError(RESUMES_OR_REPLACES)
     if given.resume and given.config:
         raise ValueError("--resume takes every option from the run folder: leave out --config")
     if given.takes_run:

@@ -5,14 +5,14 @@ import os
 import shlex
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
 from a2tg_jax.base.json_text import read_object
-from a2tg_jax.base.regular_files import expanded, is_regular
+from a2tg_jax.base.regular_files import expanded, is_regular, sha256_of
 from a2tg_jax.base.text import first_names
 from a2tg_jax.cli.arguments import defaulting_to, open_browser, print_now
 from a2tg_jax.cli.main import parsed
@@ -21,8 +21,11 @@ from a2tg_jax.results.output_paths import check_apart, check_output
 
 NUM_FRAMES = 60
 """Number of frames of the flight."""
-LISTED = ".a2tg-photographs.json"
-"""File in the output folder with the names of the photographs and their bytes, by which changes are noticed."""
+PHOTOGRAPHS = ".a2tg-photographs.json"
+CAMERAS = ".a2tg-cameras.json"
+LISTS = {PHOTOGRAPHS: ("photographs", "of another size"), CAMERAS: ("cameras", "changed")}
+"""Files in the output folder with the names of photographs and their bytes, and of files with cameras and their
+checksums, by which changes are noticed. For messages: what is listed, and what a difference means."""
 MOST_NAMED = 3
 """Largest number of photographs that a message names for each change."""
 
@@ -33,7 +36,8 @@ class Make:
 
     Finds the cameras, chooses the size of the photographs, the bytes and the iterations that this machine can train in
     the time, trains, and writes a page, a picture and a flight, a turntable if cameras surround the subject. Every step
-    is a command, which is printed. After an interruption, the same command continues, unless the photographs changed.
+    is a command, which is printed. After an interruption, the same command continues, unless photographs or cameras
+    changed.
 
     Examples:
       a2tg make photos/
@@ -53,7 +57,7 @@ class Make:
     def run(self) -> None:
         from a2tg_jax.base.checks import check_number
         from a2tg_jax.data.capture_geometry import SURROUNDED
-        from a2tg_jax.data.load import is_scene
+        from a2tg_jax.data.load import camera_files, is_scene
         from a2tg_jax.results.frames import FRONT_NAME, unseen_angle
         from a2tg_jax.results.minutes import choose_training
         from a2tg_jax.results.model_source import open_source
@@ -65,7 +69,8 @@ class Make:
         started = time.monotonic()
         sources = list(map(expanded, self.sources))
         first = sources[0]
-        name = first.resolve().stem if first.suffix else first.resolve().name
+        place = first.resolve()
+        name = place.stem if place.is_file() else place.name
         out = self.out or Path("runs") / name
         for source in sources:
             if not source.exists():
@@ -84,13 +89,18 @@ class Make:
                 raise FileExistsError(f"{path} exists, and was made from no run in {out}: choose another `out`")
         has_cameras = len(sources) == 1 and is_scene(first)
         scene = first if has_cameras else out / "scene"
-        photographs = photograph_sizes(sources)
-        if not is_new or (not has_cameras and is_scene(scene)):
-            check_unchanged(photographs, out)
-        else:
-            write_json(out / LISTED, photographs)
+        lists: dict[str, Mapping[str, object]] = {PHOTOGRAPHS: photograph_sizes(sources)}
+        if has_cameras:
+            lists[CAMERAS] = {name_in(folder_of(first), file): sha256_of(file) for file in camera_files(place)}
+        is_made = not is_new or (not has_cameras and is_scene(scene))
+        for file_name, found in lists.items():
+            if is_made:
+                check_unchanged(found, out, file_name)
+            else:
+                write_json(out / file_name, found)
         if not is_scene(scene):
-            run_step("sfm", [*map(str, sources), "--out", str(scene)])
+            # The next step follows, so that no advice how to continue is needed.
+            run_step("sfm", [*map(str, sources), "--out", str(scene)], lambda command: command.find_cameras())
         if is_new:
             left = 60 * self.minutes - (time.monotonic() - started)
             training = choose_training(scene, left)
@@ -125,37 +135,44 @@ def photograph_sizes(sources: Sequence[Path]) -> dict[str, list[int]]:
     sizes: dict[str, list[int]] = {}
     for source in sources:
         place = source.resolve()
-        folder = place if place.is_dir() else place.parent
         for file in listed_photos(place) if place.is_dir() else [place]:
-            # Names may hold bytes that are not UTF-8.
-            name = os.fsencode(file.relative_to(folder.parent).as_posix()).decode(errors="backslashreplace")
-            sizes.setdefault(name, []).append(file.stat().st_size)
+            sizes.setdefault(name_in(folder_of(source), file), []).append(file.stat().st_size)
     return {name: sorted(sizes[name]) for name in sorted(sizes)}
 
 
-def check_unchanged(photographs: dict[str, list[int]], out: Path) -> None:
-    """Raise ValueError if the photographs are not those that are listed in an output folder, naming a few."""
-    if not is_regular(out / LISTED):
+def folder_of(source: Path) -> Path:
+    """Return the full path of a source's folder, which may be itself."""
+    place = source.resolve()
+    return place if place.is_dir() else place.parent
+
+
+def name_in(folder: Path, file: Path) -> str:
+    """Return a file's path from the folder's name on, such as fox/0.jpg."""
+    # Names may hold bytes that are not UTF-8.
+    return os.fsencode(file.relative_to(folder.parent).as_posix()).decode(errors="backslashreplace")
+
+
+def check_unchanged(found: Mapping[str, object], out: Path, file_name: str) -> None:
+    """Raise ValueError, naming a few, if the files found, with their sizes or checksums, are not those in a list of an
+    output folder, one of `LISTS`."""
+    if not is_regular(out / file_name):
         return  # Earlier versions wrote no list.
-    listed = read_object(out / LISTED)
+    listed = read_object(out / file_name)
+    what, differing = LISTS[file_name]
     changes = {
-        "new": [name for name in photographs if name not in listed],
-        "removed": [name for name in listed if name not in photographs],
-        "of another size": [name for name, sizes in photographs.items() if listed.get(name, sizes) != sizes],
+        "new": [name for name in found if name not in listed],
+        "removed": [name for name in listed if name not in found],
+        differing: [name for name, value in found.items() if listed.get(name, value) != value],
     }
     counts = [f"{len(names)} {kind} ({first_names(names, MOST_NAMED)})" for kind, names in changes.items() if names]
     if counts:
         raise ValueError(
-            f"the photographs changed since {out} was made from them: {', '.join(counts)}; give another `out`, or "
+            f"the {what} changed since {out} was made from them: {', '.join(counts)}; give another `out`, or "
             f"remove {out} to begin again"
         )
 
 
-def run_step(name: str, words: Sequence[str]) -> None:
-    """Print a command and run it."""
+def run_step(name: str, words: Sequence[str], run: Callable[[Any], object] = lambda command: command.run()) -> None:
+    """Print a command and run it, by a function of the parsed command."""
     print_now(f"$ {shlex.join(['a2tg', name, *words])}")
-    command = parsed(name, words)
-    if name == "sfm":
-        command.find_cameras()  # The next step follows, so that no advice how to continue is needed.
-    else:
-        command.run()
+    run(parsed(name, words))

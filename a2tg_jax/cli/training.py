@@ -10,7 +10,7 @@ import jax
 from a2tg_jax import A2tg, Gaussians2dMcmc, Mcmc, Scene, Session, Upscale
 from a2tg_jax.base.memory import tidy_memory
 from a2tg_jax.base.text import counted
-from a2tg_jax.cli.arguments import open_browser, print_now
+from a2tg_jax.cli.arguments import RESUMES_OR_REPLACES, open_browser, print_now
 from a2tg_jax.data.load import SceneSource
 from a2tg_jax.results.folder import RunFolder, opened
 from a2tg_jax.results.record import RunRecord
@@ -50,7 +50,7 @@ def resume(folder: Path, options: RunOptions, check: Callable[[RunFolder], objec
       ValueError: if the run is to be replaced as well.
     """
     if options.overwrite:
-        raise ValueError("--resume continues a run and --overwrite replaces it: give one of them")
+        raise ValueError(RESUMES_OR_REPLACES)
     with opened(folder) as run:
         check(run)
         print_result(resume_run(run, options), folder)

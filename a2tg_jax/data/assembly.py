@@ -463,8 +463,8 @@ def with_validation_views(scene: Scene) -> Scene:
 
 
 def check_test_every(test_every: int) -> None:
-    if test_every < 0 or test_every == 1:
-        raise ValueError(f"test_every must be 0 (no test views) or at least 2; got {test_every}")
+    if test_every < 0 or test_every == 1 or test_every != int(test_every):
+        raise ValueError(f"test_every must be 0 (no test views) or a whole number of at least 2; got {test_every}")
 
 
 def every_kth(shots: Sequence[Held], test_every: int) -> tuple[list[Held], list[Held]]:

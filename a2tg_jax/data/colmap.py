@@ -57,7 +57,7 @@ def find_models(path: Path) -> list[Path]:
     """Return the folders of sparse models in a scene folder, first the folder itself, then as COLMAP numbers them."""
     sparse = path / "sparse"
     folders = [path, *_numbered_in(sparse), sparse, *_numbered_in(path)]
-    return [folder for folder in folders if _model_files(folder)]
+    return [folder for folder in folders if model_files(folder)]
 
 
 def _numbered_in(folder: Path) -> list[Path]:
@@ -75,7 +75,7 @@ def _model_of(path: Path) -> Path:
         raise FileNotFoundError(f"{path}: has no sparse model; expected sparse/0 with cameras, images and points3D")
     if len(models) == 1:
         return models[0]
-    counts = {model: num_images(_model_files(model)["images"]) for model in models}
+    counts = {model: num_images(model_files(model)["images"]) for model in models}
     # A model's own folder, if given, is the user's choice.
     chosen = path if path in models else max(models, key=lambda model: counts[model])
 
@@ -115,7 +115,7 @@ def load_colmap(path: Path, options: SceneOptions, shelf: Shelf) -> Scene:
         photos.append(Photo(image.name, viewmat, file, below_images, lens, str(folder / image.name), panorama=panorama))
 
     def how_to_remove(name: str) -> str:
-        file = _model_files(model)["images"]
+        file = model_files(model)["images"]
         if file.suffix.lower() == ".txt":
             return f"delete its two lines in {file}"
         return (
@@ -221,7 +221,7 @@ def _panoramas(viewmats: np.ndarray) -> list[int | None]:
     return [places.get(view) for view in range(len(centers))]
 
 
-def _model_files(folder: Path) -> dict[str, Path]:
+def model_files(folder: Path) -> dict[str, Path]:
     """Return the files of the model in a folder by kind, whatever their capitals; none if it has no model."""
     names = {name.lower(): name for name in names_in(folder)}
     for suffix in SUFFIXES:
@@ -237,9 +237,11 @@ def _model_files(folder: Path) -> dict[str, Path]:
 
 def _read_model(model: Path) -> SparseModel:
     """Return the model in a folder; without a points3D file, it has no points."""
-    files = _model_files(model)
+    files = model_files(model)
     records = {kind: read_file(file, kind) for kind, file in files.items()}
     cameras = dict(records["cameras"])
+    if len(cameras) < len(records["cameras"]):
+        raise ValueError(f"{files['cameras']}: has two cameras of one number; give each its own, in the images too")
     images = records["images"]
     text = on_disk(model, "images.txt") if files["images"].suffix.lower() == ".bin" else None
     num_in_text = len(images) if text is None else num_images(text)

@@ -12,7 +12,6 @@ their features in a second line. References to records that do not exist are ign
 from its file alone.
 """
 
-import functools
 import mmap
 import os
 import re
@@ -26,7 +25,7 @@ import numpy as np
 
 from a2tg_jax.base.regular_files import open_regular
 from a2tg_jax.base.text import shortened
-from a2tg_jax.data.colmap_cameras import BY_NAME, MODELS, CameraModel, ColmapCamera
+from a2tg_jax.data.colmap_cameras import BY_NAME, MODELS, ColmapCamera
 
 KINDS = ("cameras", "images", "points3D")
 """Names of the files that are read, without suffix. A model has cameras and images."""
@@ -89,9 +88,7 @@ def _decoded_name(path: Path, name: bytes) -> str:
         ) from None
 
 
-@functools.cache
-def _little_endian(format: str) -> struct.Struct:
-    return struct.Struct(f"<{format}")
+# Binary files
 
 
 class _Bytes:
@@ -117,131 +114,109 @@ class _Bytes:
         return start
 
     def take(self, format: str) -> tuple[Any, ...]:
-        numbers = _little_endian(format)
-        return numbers.unpack_from(self.data, self.skip(numbers.size))
-
-    def whole(self, format: str = "I") -> int:
-        (number,) = self.take(format)
-        return int(number)
-
-    def floats(self, count: int) -> list[float]:
-        return list(self.take(f"{count}d"))
-
-    def model(self) -> CameraModel:
-        number = self.whole("i")
-        if number not in MODELS:
-            raise self.error(f"has the camera model {number}, which is none of COLMAP's")
-        return MODELS[number]
-
-    def params(self, model: CameraModel) -> list[float]:
-        return self.floats(model.num_params)
-
-    def name(self) -> str:
-        end = self.data.find(b"\0", self.at, self.at + LONGEST_NAME)
-        if end < 0:
-            raise self.error("has a name that does not end")
-        return _decoded_name(self.path, self.data[self.skip(end + 1 - self.at) : end])
-
-    def skip_features(self) -> None:
-        self.skip(24 * self.whole("Q"))
-
-    def point(self) -> bytes:
-        start = self.skip(POINT.itemsize)
-        point = self.data[start : self.at]
-        self.skip(8 * self.whole("Q"))  # The track, which is not needed.
-        return point
+        """Return numbers, which are little-endian."""
+        format = f"<{format}"
+        return struct.unpack_from(format, self.data, self.skip(struct.calcsize(format)))
 
 
-class _Words:
-    """What is in a line of a text file, in order; of images also the line of features after it."""
-
-    def __init__(self, path: Path, line: bytes, features: bytes):
-        self.path = path
-        self.line = line
-        self.features = features
-        self.words = iter(line.split())
-
-    def whole(self, format: str = "") -> int:
-        """Return a whole number of at least 0, which may be written like 96.0."""
-        word = next(self.words)
-        number = int(word) if word.isdigit() else float(word)  # A float would round ids above 2^53.
-        if not 0 <= number < 1 << 64 or number != int(number):  # NaN fails as well.
-            raise ValueError(f"{shortened(word.decode(errors='replace'))} is not a whole number of at least 0")
-        return int(number)
-
-    def floats(self, count: int) -> list[float]:
-        return [float(next(self.words)) for _ in range(count)]
-
-    def model(self) -> CameraModel:
-        name = next(self.words).decode("ascii", "replace")
-        if name not in BY_NAME:
-            raise ValueError(f"COLMAP has no camera model {shortened(name)}")
-        return BY_NAME[name]
-
-    def params(self, model: CameraModel) -> list[float]:
-        params = [float(word) for word in self.words]
-        if len(params) != model.num_params:
-            raise ValueError(f"{model.name} has {model.num_params} parameters; got {len(params)}")
-        return params
-
-    def name(self) -> str:
-        next(self.words)
-        self.words = iter(())  # The name is the rest of the line, which may have spaces.
-        return _decoded_name(self.path, self.line.split(None, 9)[9].strip())
-
-    def skip_features(self) -> None:
-        # Each feature has x, y and the id of its point, or -1. If the line is missing, this is the next image's, which
-        # ends with a name.
-        triples = self.features.split()
-        ids = triples[2:3] + triples[-1:]
-        if len(triples) % 3 or not all(re.fullmatch(rb"-1|\d+(\.0*)?", word) for word in ids):
-            raise ValueError("the line of its points is missing or cut off")
-
-    def point(self) -> tuple[int, list[float], list[int], float]:
-        number = self.whole()
-        position = self.floats(3)
-        color = [min(max(round(value), 0), 255) for value in self.floats(3)]
-        (error,) = self.floats(1)
-        if len(list(self.words)) % 2:
-            raise ValueError("the track of a point must be pairs")
-        return number, position, color, error
+def _camera_of_bytes(source: _Bytes) -> tuple[int, ColmapCamera]:
+    number, model_number, width, height = source.take("IiQQ")
+    if model_number not in MODELS:
+        raise source.error(f"has the camera model {model_number}, which is none of COLMAP's")
+    model = MODELS[model_number]
+    return number, ColmapCamera(model.name, width, height, source.take(f"{model.num_params}d"))
 
 
-Source = _Bytes | _Words
+def _image_of_bytes(source: _Bytes) -> ImageRecord:
+    number, *pose, camera_id = source.take("I7dI")
+    end = source.data.find(b"\0", source.at, source.at + LONGEST_NAME)
+    if end < 0:
+        raise source.error("has a name that does not end")
+    name = _decoded_name(source.path, source.data[source.skip(end + 1 - source.at) : end])
+    (num_features,) = source.take("Q")
+    source.skip(24 * num_features)
+    return ImageRecord(number, pose, camera_id, name)
 
 
-def _camera(source: Source) -> tuple[int, ColmapCamera]:
-    number = source.whole()
-    model = source.model()
-    width = source.whole("Q")
-    height = source.whole("Q")
-    return number, ColmapCamera(model.name, width, height, tuple(source.params(model)))
+def _point_of_bytes(source: _Bytes) -> bytes:
+    start = source.skip(POINT.itemsize)
+    point = source.data[start : source.at]
+    (num_observations,) = source.take("Q")
+    source.skip(8 * num_observations)
+    return point
 
 
-def _image(source: Source) -> ImageRecord:
-    image = ImageRecord(source.whole(), source.floats(7), source.whole(), source.name())
-    source.skip_features()
-    return image
-
-
-RECORDS: dict[str, Callable[[Source], Any]] = {
-    "cameras": _camera,
-    "images": _image,
-    "points3D": lambda source: source.point(),
-}
+OF_BYTES: dict[str, Callable[[_Bytes], Any]] = {
+    "cameras": _camera_of_bytes, "images": _image_of_bytes, "points3D": _point_of_bytes,
+}  # fmt: skip
 
 
 def _read_binary(path: Path, data: mmap.mmap | bytes, kind: str) -> Any:
     source = _Bytes(path, data)
-    num = source.whole("Q")
+    (num,) = source.take("Q")
     records = []
     for number in range(1, num + 1):
         source.place = f"number {number} of {num} {kind}"
-        records.append(RECORDS[kind](source))
+        records.append(OF_BYTES[kind](source))
     left = len(data) - source.at
     if left:
         raise source.error(f"is followed by {left} bytes")
     return np.frombuffer(b"".join(records), POINT) if kind == "points3D" else records
+
+
+# Text files
+
+
+def _words(line: bytes, least: int) -> list[bytes]:
+    words = line.split()
+    if len(words) < least:
+        raise ValueError("it is cut off")
+    return words
+
+
+def _whole(word: bytes) -> int:
+    """Return a whole number of at least 0, which may be written like 96.0."""
+    number = int(word) if word.isdigit() else float(word)  # A float would round ids above 2^53.
+    if not 0 <= number < 1 << 64 or number != int(number):  # NaN fails as well.
+        raise ValueError(f"{shortened(word.decode(errors='replace'))} is not a whole number of at least 0")
+    return int(number)
+
+
+def _camera_of_line(path: Path, line: bytes, _: bytes) -> tuple[int, ColmapCamera]:
+    number, model, width, height, *params = _words(line, 4)
+    name = model.decode("ascii", "replace")
+    if name not in BY_NAME:
+        raise ValueError(f"COLMAP has no camera model {shortened(name)}")
+    if len(params) != BY_NAME[name].num_params:
+        raise ValueError(f"{name} has {BY_NAME[name].num_params} parameters; got {len(params)}")
+    return _whole(number), ColmapCamera(name, _whole(width), _whole(height), tuple(map(float, params)))
+
+
+def _image_of_line(path: Path, line: bytes, features: bytes) -> ImageRecord:
+    number, *numbers, camera_id = _words(line, 10)[:9]
+    # The name is the rest of the line, which may have spaces.
+    name = _decoded_name(path, line.split(None, 9)[9].strip())
+    # Each feature has x, y and the id of its point, or -1. If the line is missing, this is the next image's, which
+    # ends with a name.
+    triples = features.split()
+    ids = triples[2:3] + triples[-1:]
+    if len(triples) % 3 or not all(re.fullmatch(rb"-1|\d+(\.0*)?", word) for word in ids):
+        raise ValueError("the line of its points is missing or cut off")
+    return ImageRecord(_whole(number), [float(word) for word in numbers], _whole(camera_id), name)
+
+
+def _point_of_line(path: Path, line: bytes, _: bytes) -> tuple[int, list[float], list[int], float]:
+    number, *numbers = _words(line, 8)
+    *position, red, green, blue, error = map(float, numbers[:7])
+    if len(numbers[7:]) % 2:
+        raise ValueError("the track of a point must be pairs")
+    color = [min(max(round(value), 0), 255) for value in (red, green, blue)]
+    return _whole(number), position, color, error
+
+
+OF_LINE: dict[str, Callable[[Path, bytes, bytes], Any]] = {
+    "cameras": _camera_of_line, "images": _image_of_line, "points3D": _point_of_line,
+}  # fmt: skip
 
 
 def _read_text(file: BinaryIO, path: Path, kind: str) -> Any:
@@ -256,15 +231,13 @@ def _read_text(file: BinaryIO, path: Path, kind: str) -> Any:
             continue
         try:
             _, features = next(lines, (0, b"")) if kind == "images" else (0, b"")
-            source = _Words(path, line, features)
-            records.append(RECORDS[kind](source))
-            if next(source.words, None) is not None:
-                raise ValueError("it continues past its end")
-        except (ValueError, OverflowError, StopIteration) as error:
+            records.append(OF_LINE[kind](path, line, features))
+        except (ValueError, OverflowError) as error:
             if str(error).startswith(str(path)):  # It names the file already.
                 raise
-            reason = "it is cut off" if isinstance(error, StopIteration) else shortened(str(error))
-            raise ValueError(f"{path}: line {number} cannot be read ({reason}); export the model again") from None
+            raise ValueError(
+                f"{path}: line {number} cannot be read ({shortened(str(error))}); export the model again"
+            ) from None
     if announced not in (None, len(records)):
         message = f"{path}: says that it has {announced} {kind}, and has {len(records)}: if it is cut off, export it"
         warnings.warn(f"{message} again", stacklevel=3)

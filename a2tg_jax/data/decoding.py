@@ -31,18 +31,12 @@ TIFF_SIZE = 256, 257
 TURNED = range(2, 9)
 SIDEWAYS = range(5, 9)
 """EXIF orientations other than upright, and the ones that exchange width and height."""
-AS_STORED = {
-    2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180, 4: Image.Transpose.FLIP_TOP_BOTTOM,
-    5: Image.Transpose.TRANSPOSE, 6: Image.Transpose.ROTATE_90, 7: Image.Transpose.TRANSVERSE,
-    8: Image.Transpose.ROTATE_270,
-}  # fmt: skip
-"""Turn from the upright picture to the stored one, by EXIF orientation."""
 LENS_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model, ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
 GPANO = re.compile(rb"""GPano:(\w+)(?:\s*=\s*["']|>)\s*([\w.]+)""")
 """Name and value in the XMP of a panorama."""
 LONGEST_REASON = 200
-LARGEST_LEVEL = {"L": 255, "I;16": 65535, "I": 65535}
-"""Largest level of grey, by Pillow's mode."""
+LARGEST_LEVEL = {"L": 255, "I;16": 65535, "I;16B": 65535, "I": 65535}
+"""Largest level of grey, by Pillow's mode. I is 16 bits of PNG, in some versions, and PPM, and 32 bits of TIFF."""
 MOST_BYTES = 1 << 30
 """Largest size of an image file: the size of the largest uncompressed picture."""
 MAX_PIXELS = 128_000_000
@@ -67,10 +61,10 @@ def read_pixels(path: str | os.PathLike[str]) -> np.ndarray:
     """
     with _opened(path) as image:
         has_alpha = _has_alpha(image)
-        # Pillow turns TIFF, and no other format, as it decodes.
-        turn = image.tag_v2.get(ExifTags.Base.Orientation) if image.format == "TIFF" else None  # type: ignore[attr-defined]
-        converted = image.convert("RGBA" if has_alpha else "RGB")
-        pixels = np.asarray(converted.transpose(AS_STORED[turn]) if turn in AS_STORED else converted)
+        # Pillow turns TIFF, and no other format, as it decodes, by this tag.
+        if image.format == "TIFF":
+            image.getexif()[ExifTags.Base.Orientation] = 1
+        pixels = np.asarray(image.convert("RGBA" if has_alpha else "RGB"))
     # One picture with alpha gives all batches an opacity (training.batches), so drop an opaque one.
     if has_alpha and (pixels[..., 3] == 255).all():
         return np.ascontiguousarray(pixels[..., :3])  # A view would keep the fourth channel in memory.
@@ -185,7 +179,7 @@ def read_grey(path: str | os.PathLike[str]) -> tuple[np.ndarray, int]:
     Raises as `read_pixels` does, and for colours.
     """
     with _opened(path, most_bits=16) as image:
-        if image.mode not in LARGEST_LEVEL:
+        if image.mode not in LARGEST_LEVEL or (image.mode, image.format) == ("I", "TIFF"):
             raise ValueError(
                 f"{path}: must be greyscale, of 8 or 16 bits; its mode is {image.mode}; replace or remove it"
             )

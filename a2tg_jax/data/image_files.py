@@ -3,7 +3,7 @@
 import os
 import unicodedata
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePath, PureWindowsPath
 from typing import TypeVar
@@ -84,6 +84,33 @@ def _letters(name: str) -> str:
     return unicodedata.normalize("NFC", name.casefold())
 
 
+def is_photo(file: PurePath) -> bool:
+    """Return whether a file is a photograph by its name."""
+    # macOS puts ._0.jpg, which is no picture, next to 0.jpg on disks of other systems.
+    return file.suffix.lower() in PHOTO_SUFFIXES and file.name[0] != "."
+
+
+def is_hidden(name: PurePath) -> bool:
+    """Return whether a path below a folder is in a hidden folder, or in one such as @eaDir, Synology's thumbnails."""
+    return any(part[0] in ".@" for part in name.parts[:-1])
+
+
+def files_below(folder: Path) -> Iterator[Path]:
+    """Yield the files in a folder and below it, also where links to folders lead, each folder once."""
+    seen = set()
+    for place, folders, names in os.walk(folder, followlinks=True):
+        real = os.path.realpath(place)
+        if real in seen:  # A link may lead to a folder above it.
+            folders.clear()
+            continue
+        seen.add(real)
+        folders.sort()
+        for name in names:
+            file = Path(place, name)
+            if file.is_file():
+                yield file
+
+
 def warn_of_unposed(folder: Path, names: Iterable[str], is_deep: bool = True) -> None:
     """Warn of photographs in a folder (`is_deep`: and its subfolders) that are not among some names.
 
@@ -93,9 +120,9 @@ def warn_of_unposed(folder: Path, names: Iterable[str], is_deep: bool = True) ->
         return
     posed = {_letters(PurePath(name).with_suffix("").as_posix()) for name in names}
     others = []
-    for file in folder.rglob("*") if is_deep else folder.iterdir():
+    for file in files_below(folder) if is_deep else folder.iterdir():
         name = file.relative_to(folder)
-        if name.suffix.lower() in PHOTO_SUFFIXES and _letters(name.with_suffix("").as_posix()) not in posed:
+        if is_photo(name) and not is_hidden(name) and _letters(name.with_suffix("").as_posix()) not in posed:
             others.append(name.as_posix())
     others.sort()
     if others:

@@ -129,9 +129,8 @@ class Lens:
         """
         if not self.is_kept or self.is_pinhole:
             return None
-        K = _scaled_intrinsics(self.camera.matrix, self.size, (width, height))
         with _LOCK:  # Threads that read photographs of one lens share its rays.
-            return _rays(self.camera, (width, height), K.tobytes())
+            return _rays(self.camera, (width, height))
 
     def _undistorted(self, planes: np.ndarray) -> np.ndarray:
         """Return float32 planes of the undistorted image, sampled bilinearly from planes [h, w, C] of a photograph."""
@@ -168,10 +167,11 @@ def sampled(
 
 
 @functools.lru_cache(maxsize=256)
-def _rays(camera: ColmapCamera, picture: tuple[int, int], K: bytes) -> np.ndarray:
+def _rays(camera: ColmapCamera, picture: tuple[int, int]) -> np.ndarray:
     """Return the rays of a lens for pictures of a size; the same array for the same lens."""
     x, y = np.meshgrid(*(np.arange(side) + 0.5 for side in picture))
-    places = np.stack([x, y], -1).reshape(-1, 2) * np.divide((camera.width, camera.height), picture)
+    size = (camera.width, camera.height)
+    places = np.stack([x, y], -1).reshape(-1, 2) * np.divide(size, picture)
     slopes = camera.slopes(places)
     # A polynomial that folds has no inverse there: what comes back must lead to the pixel again.
     again = camera.pixels(_homogeneous(np.nan_to_num(slopes)))
@@ -182,7 +182,7 @@ def _rays(camera: ColmapCamera, picture: tuple[int, int], K: bytes) -> np.ndarra
             f"{camera.name} gives {is_ray.mean():.0%} of the pixels a ray within {np.rad2deg(WIDEST_ANGLE):.0f}° of "
             "the direction of view: are its parameters right?"
         )
-    in_plane = _homogeneous(slopes) @ np.frombuffer(K).reshape(3, 3)[:2].T
+    in_plane = _homogeneous(slopes) @ _scaled_intrinsics(camera.matrix, size, picture)[:2].T
     width, height = picture
     rays = np.where(is_ray[:, None], in_plane, np.nan).astype(np.float32).reshape(height, width, 2)
     rays.setflags(write=False)  # Views share it.

@@ -3,14 +3,15 @@
 import dataclasses
 import functools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
 
 from a2tg_jax import Scene
 from a2tg_jax.base.regular_files import expanded, is_regular
+from a2tg_jax.base.text import shortened
 from a2tg_jax.data.assembly import scene_name, warn_of_lenses, with_validation_views
-from a2tg_jax.data.colmap import find_models, load_colmap
+from a2tg_jax.data.colmap import IMAGES, find_models, load_colmap, model_files
 from a2tg_jax.data.lenses import LensUse, forget_rays
 from a2tg_jax.data.phone_captures import polycam, record3d
 from a2tg_jax.data.photo_folder import capture_hint, holds_photos, is_video
@@ -26,6 +27,7 @@ from a2tg_jax.data.transforms import (
     load_folder,
     load_frames,
     load_transforms,
+    names_masks,
     transforms_in,
 )
 from a2tg_jax.host.errors import as_argument
@@ -127,6 +129,45 @@ def is_scene(folder: Path) -> bool:
     return _loader(folder) is not None
 
 
+def camera_files(path: Path) -> list[Path]:
+    """Return the files with the cameras and points of a scene folder or file, sorted, in all known formats that are
+    there."""
+    if is_regular(path):
+        return [path]
+    files = [path / name for name in BLENDER_FILES if is_regular(path / name)]
+    files += transforms_in(path)
+    for model in (*find_models(path), *find_models(path / "colmap")):
+        files += model_files(model).values()
+    for find in OTHER_PROGRAMS:
+        for cameras in find(path):
+            files += cameras.files or [cameras.file]
+    return sorted(set(files))
+
+
+def names_below_images(path: Path, names: Sequence[str]) -> list[str]:
+    """Return the paths of a scene's photographs below its folder `images`, next to which masks are read.
+
+    Raises:
+      ValueError: if a photograph is elsewhere, or the scene names masks itself, so that masks there are not read.
+    """
+    load = _loader(path)
+    if load is not None and load.func is load_colmap:
+        return list(names)
+    for file in [path] if is_regular(path) else transforms_in(path)[:1]:
+        if names_masks(file):
+            raise ValueError(
+                f"{file}: names masks by mask_path, which training reads instead of others: remove mask_path from its "
+                "frames"
+            )
+    others = [name for name in names if not name.startswith(f"{IMAGES}/")]
+    if others:
+        raise ValueError(
+            f"{path}: training reads masks of photographs in the folder {IMAGES} only, and {shortened(others[0])} is "
+            f"elsewhere: move the photographs to {IMAGES}, and change their names in the file of the cameras"
+        )
+    return [name.removeprefix(f"{IMAGES}/") for name in names]
+
+
 def _read(path: Path, options: SceneOptions, room: int | None) -> Scene:
     """Read the scene at a path, or raise FileNotFoundError that says what is there instead."""
     if room is not None and room < 0:
@@ -148,7 +189,7 @@ def _read(path: Path, options: SceneOptions, room: int | None) -> Scene:
     return scene
 
 
-def _loader(path: Path) -> Callable[[SceneOptions, Shelf], Scene] | None:
+def _loader(path: Path) -> functools.partial[Scene] | None:
     """Return the function that loads what is at a path, or None."""
     if is_regular(path):
         # OpenSfM's reconstruction.json is JSON as well, but no transforms file.

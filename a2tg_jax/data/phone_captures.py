@@ -13,12 +13,11 @@ import numpy as np
 from scipy.ndimage import binary_dilation, label
 from scipy.spatial.transform import Rotation
 
-from a2tg_jax.base.json_text import MOST_BYTES, lenient_number, read_object
+from a2tg_jax.base.json_text import MOST_BYTES, lenient_number, number_rows, read_object
 from a2tg_jax.base.regular_files import is_regular, read_regular
-from a2tg_jax.base.text import shortened
 from a2tg_jax.data.assembly import PointCloud
 from a2tg_jax.data.decoding import picture_size, read_grey, read_pixels
-from a2tg_jax.data.image_files import PHOTO_SUFFIXES, find_image, map_in_threads
+from a2tg_jax.data.image_files import find_image, is_photo, map_in_threads
 from a2tg_jax.data.transforms import Cameras, Frames, check_images
 
 POLYCAM_FOLDERS = (("corrected_cameras", "corrected_images"), ("cameras", "corrected_images"), ("cameras", "images"))
@@ -44,8 +43,9 @@ def polycam(path: Path) -> list[Cameras]:
     for base in (path / "keyframes", path):
         for name, images in POLYCAM_FOLDERS:
             folder = base / name
-            if folder.is_dir() and (base / images).is_dir() and any(folder.glob("*.json")):
-                cameras.append(Cameras(folder, functools.partial(_polycam_frames, folder, base / images)))
+            files = sorted(folder.glob("*.json"))
+            if files and (base / images).is_dir():
+                cameras.append(Cameras(folder, functools.partial(_polycam_frames, folder, base / images), files))
                 break
     return cameras
 
@@ -147,12 +147,12 @@ def record3d(path: Path) -> list[Cameras]:
 def _record3d_frames(file: Path) -> Frames:
     """Return the frames of Record3D: image N has pose N of the metadata, a quaternion (x, y, z, w) and a position."""
     values = read_object(file)
-    poses = _rows(values.get("poses"), 7, f"{file}: poses")
+    poses = number_rows(values.get("poses"), 7, f"{file}: poses")
     given = values.get("perFrameIntrinsicCoeffs")
-    intrinsics = _rows(given, 4, f"{file}: perFrameIntrinsicCoeffs") if given else np.empty((0, 4))
+    intrinsics = number_rows(given, 4, f"{file}: perFrameIntrinsicCoeffs") if given else np.empty((0, 4))
     if not given or len(intrinsics) < len(poses):
         # K is stored by columns: fx, 0, 0, 0, fy, 0, cx, cy, 1.
-        K = _rows([values.get("K")], 9, f"{file}: K")
+        K = number_rows([values.get("K")], 9, f"{file}: K")
         intrinsics = np.repeat(K[:, [0, 4, 6, 7]], len(poses), axis=0)
     size: dict[str, Any] = {key: values[key] for key in ("w", "h") if key in values}
     images = _numbered_images(file.parent)
@@ -180,24 +180,9 @@ def _record3d_frames(file: Path) -> Frames:
 def _numbered_images(folder: Path) -> dict[int, Path]:
     """Return the images in the first of `IMAGE_FOLDERS` that has some named by number, in order of these."""
     for name in IMAGE_FOLDERS:
-        images = [
-            image
-            for image in (folder / name).glob("*")
-            if image.suffix.lower() in PHOTO_SUFFIXES and image.stem.isdecimal()
-        ]
+        images = [image for image in (folder / name).glob("*") if is_photo(image) and image.stem.isdecimal()]
         if images:
             # Reversed, because a dict keeps the last: of 0.jpg and 0.png the first by name.
             by_number = {int(image.stem): image for image in sorted(images, reverse=True)}
             return dict(sorted(by_number.items()))
     return {}
-
-
-def _rows(value: object, width: int, what: str) -> np.ndarray:
-    """Return rows [N, width] of finite numbers, or raise ValueError."""
-    try:
-        rows = np.asarray(value, np.float64)
-    except (TypeError, ValueError, OverflowError):
-        rows = np.empty(0)
-    if rows.ndim != 2 or rows.shape[1] != width or not np.isfinite(rows).all():
-        raise ValueError(f"{what} must be rows of {width} finite numbers; got {shortened(value)}")
-    return rows

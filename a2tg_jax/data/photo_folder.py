@@ -10,7 +10,7 @@ import math
 import re
 import warnings
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
 
@@ -19,7 +19,7 @@ import numpy as np
 from a2tg_jax.base.regular_files import is_regular, names_in, read_regular
 from a2tg_jax.base.text import PROGRAM, counted, first_names
 from a2tg_jax.data.decoding import software_of, upright_thumbnail
-from a2tg_jax.data.image_files import PHOTO_SUFFIXES, map_in_threads
+from a2tg_jax.data.image_files import PHOTO_SUFFIXES, files_below, is_hidden, is_photo, map_in_threads
 from a2tg_jax.data.other_runs import other_run
 from a2tg_jax.host.errors import as_argument
 
@@ -90,7 +90,7 @@ def is_video(path: Path) -> bool:
 
 def holds_photos(folder: Path) -> bool:
     """Return whether a folder has enough photographs in it or below it."""
-    photos = (file for file in _files_below(folder) if file.suffix.lower() in PHOTO_SUFFIXES)
+    photos = filter(is_photo, files_below(folder))
     return len(list(itertools.islice(photos, LEAST_PHOTOS))) == LEAST_PHOTOS
 
 
@@ -99,8 +99,7 @@ def listed_photos(folder: Path) -> list[Path]:
 
     Unlike `find_photos`, with copies of others, which take long to find, and in any number.
     """
-    files = sorted(file for file in _files_below(folder) if file.suffix.lower() in PHOTO_SUFFIXES)
-    pictures = {file.relative_to(folder).as_posix(): file for file in files}
+    pictures = {file.relative_to(folder).as_posix(): file for file in sorted(filter(is_photo, files_below(folder)))}
     others = set().union(*_no_photographs(folder, list(pictures)).values())
     return [file for name, file in pictures.items() if name not in others]
 
@@ -125,10 +124,10 @@ def find_photos(folder: Path, least: int = LEAST_PHOTOS, chosen: Sequence[Path] 
         hint = capture_hint(file)
         if hint is not None:
             raise ValueError(f"{file}: {hint}")
-    found = _files_below(folder) if chosen is None else set(chosen)
-    files = sorted(file.relative_to(folder) for file in found)
-    pictures = [file.as_posix() for file in files if file.suffix.lower() in PHOTO_SUFFIXES]
-    unread = [file for file in files if file.suffix.lower() not in PHOTO_SUFFIXES]
+    found = files_below(folder) if chosen is None else set(chosen)
+    files = sorted(file.relative_to(folder) for file in found if file.name[0] != ".")
+    pictures = [file.as_posix() for file in files if is_photo(file)]
+    unread = [file for file in files if not is_photo(file)]
     left_out = _left_out(folder, pictures)
     others = set().union(*left_out.values())
     photos = [name for name in pictures if name not in others]
@@ -166,11 +165,9 @@ def _left_out(folder: Path, pictures: Sequence[str]) -> dict[str, set[str]]:
 
 def _no_photographs(folder: Path, pictures: Sequence[str]) -> dict[str, set[str]]:
     """Return the pictures that are no photographs by what they are."""
-    # Such as @eaDir, Synology's folder of thumbnails.
-    hidden = {name for name in pictures if any(part[0] in ".@" for part in name.split("/")[:-1])}
     return {
         OWN: _written(folder, pictures),
-        "in hidden folders": hidden,
+        "in hidden folders": {name for name in pictures if is_hidden(PurePosixPath(name))},
         "masks or depth maps": _masks(pictures),
     }
 
@@ -181,11 +178,6 @@ def _about_left_out(left_out: Mapping[str, set[str]]) -> str:
     return f"Not taken for photographs: {'; '.join(counts)}{advice}"
 
 
-def _files_below(folder: Path) -> Iterator[Path]:
-    # macOS puts ._0.jpg, which is no picture, next to 0.jpg on disks of other systems.
-    return (file for file in folder.rglob("*") if file.name[0] != "." and file.is_file())
-
-
 def _skipped(folder: Path, files: list[Path]) -> str:
     """Return the number of skipped files by suffix, the formats that are read, and how to convert others."""
     counts = Counter(file.suffix.lower() or "without suffix" for file in files)
@@ -194,14 +186,18 @@ def _skipped(folder: Path, files: list[Path]) -> str:
         f"Skipped: {', '.join(parts)}{', …' if len(counts) > MOST_TOLD else ''}; read: {', '.join(PHOTO_SUFFIXES)}; "
         f"videos: {', '.join(VIDEO_SUFFIXES[:MOST_TOLD])}, …"
     )
-    foreign = next((file for file in files if file.suffix.lower() in FOREIGN_SUFFIXES), None)
-    video = next((file for file in files if file.suffix.lower() in VIDEO_SUFFIXES), None)
-    spherical = next((file for file in files if file.suffix.lower() in SPHERICAL_SUFFIXES), None)
+
+    def first_of(suffixes: Sequence[str]) -> Path | None:
+        return next((file for file in files if file.suffix.lower() in suffixes), None)
+
+    spherical = first_of(SPHERICAL_SUFFIXES)
     if spherical is not None:
         message += f". {spherical} {capture_hint(spherical)}"
+    foreign = first_of(FOREIGN_SUFFIXES)
     if foreign is not None:
         pattern = as_argument(folder / foreign.parent / f"*{foreign.suffix}")  # ImageMagick itself expands the star.
         message += f". To make JPEG files of them: magick mogrify -format jpg {pattern}"
+    video = first_of(VIDEO_SUFFIXES)
     if video is not None:
         message += f". A video is given by itself: a2tg sfm {as_argument(folder / video)} SCENE"
     return message

@@ -16,12 +16,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from a2tg_jax.base.json_text import MOST_BYTES
+from a2tg_jax.base.json_text import MOST_BRACKETS, MOST_BYTES
 from a2tg_jax.base.regular_files import is_regular, names_in, open_regular, read_regular
 from a2tg_jax.base.text import shortened
 from a2tg_jax.data.assembly import rigid_motion
 from a2tg_jax.data.decoding import picture_size
-from a2tg_jax.data.image_files import PHOTO_SUFFIXES, find_image, warn_of_unposed
+from a2tg_jax.data.image_files import files_below, find_image, is_photo, warn_of_unposed
 from a2tg_jax.data.ply import read_ply_points
 from a2tg_jax.data.transforms import Cameras, Frames, check_images
 
@@ -69,10 +69,9 @@ def _metashape_frames(file: Path) -> Frames:
     folder = file.parent
     images = folder / "images"
     below: dict[str, set[Path]] = defaultdict(set)  # Images in all folders below, with and without suffix.
-    for each in images.rglob("*"):
-        if each.suffix.lower() in PHOTO_SUFFIXES and is_regular(each):
-            below[each.name].add(each)
-            below[each.stem].add(each)
+    for each in filter(is_photo, files_below(images)):
+        below[each.name].add(each)
+        below[each.stem].add(each)
     frames = []
     lacking: list[str] = []
     for label, sensor, pose in _posed_cameras(file):
@@ -246,11 +245,12 @@ def _equidistant_terms(lens: dict[str, Any], what: str) -> dict[str, float]:
 def realityscan(path: Path) -> list[Cameras]:
     """Return the cameras of RealityScan's XMP files in a folder, and of those anywhere below its folder images."""
     cameras = []
-    for names in (path.glob("*.xmp"), (path / "images").rglob("*.xmp")):
-        files = [file for file in sorted(names) if b"xcr:Rotation" in read_regular(file, MOST_BYTES)]
+    for found in (map(path.joinpath, names_in(path)), files_below(path / "images")):
+        beside = (file for file in found if file.suffix.lower() == ".xmp" and is_regular(file))
+        files = [file for file in sorted(beside) if b"xcr:Rotation" in read_regular(file, MOST_BYTES)]
         # Files of another alignment may be left in one of the two.
         if files:
-            cameras.append(Cameras(files[0], functools.partial(_realityscan_frames, path, files)))
+            cameras.append(Cameras(files[0], functools.partial(_realityscan_frames, path, files), files))
     return cameras
 
 
@@ -335,11 +335,15 @@ def _with_points(file: Path, frames: list[dict[str, Any]]) -> Frames:
 
 
 def _read_xml(file: Path) -> Element:
-    """Return the root of an XML file. Entity declarations, which can expand without limit, are rejected."""
+    """Return the root of an XML file. Entities, which can expand without limit, and very many elements are rejected."""
     data = read_regular(file, MOST_BYTES)
     try:
-        if b"<!ENTITY" in data or b"<!DOCTYPE" in data:
-            raise ValueError("it declares entities")
+        # Of the encodings that the parser reads, only UTF-16 would hide these bytes, and it has zeros.
+        if b"<!DOCTYPE" in data or b"\0" in data:
+            raise ValueError("it declares entities, or is UTF-16")
+        num_tags = data.count(b"<")
+        if num_tags > MOST_BRACKETS:
+            raise ValueError(f"it has {num_tags:,} tags; the limit is {MOST_BRACKETS:,}")
         return ElementTree.fromstring(data)
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise ValueError(f"{file}: cannot be read as XML ({shortened(str(error))}); export it again") from None

@@ -61,6 +61,8 @@ class Cameras(NamedTuple):
     """Their file or folder, which messages name."""
     read: Callable[[], Frames]
     """Function that reads them."""
+    files: Sequence[Path] = ()
+    """All files with cameras, if there are several."""
 
 
 def load_transforms(file: Path, options: SceneOptions, shelf: Shelf) -> Scene:
@@ -202,6 +204,12 @@ def _read_meta(file: Path) -> dict[str, Any]:
     return meta
 
 
+def names_masks(file: Path) -> bool:
+    """Return whether a transforms file names a mask."""
+    meta = _read_meta(file)
+    return any(values.get("mask_path") for values in (meta, *meta["frames"]))
+
+
 def _read_shots(
     metas: Mapping[Path, dict[str, Any]], options: SceneOptions, shelf: Shelf, counted: Counted | None = None
 ) -> list[list[Shot]]:
@@ -211,7 +219,11 @@ def _read_shots(
     """
     photos = []
     for file, meta in metas.items():
-        photos += [_photo(file, {**meta, **frame}, options.lens, counted) for frame in meta["frames"]]
+        without_focal = {key: value for key, value in meta.items() if not key.startswith("fl_")}
+        for frame in meta["frames"]:
+            # The file's focal length would be preferred to the frame's angle.
+            shared = without_focal if {"camera_angle_x", "camera_angle_y"} & frame.keys() else meta
+            photos.append(_photo(file, {**shared, **frame}, options.lens, counted))
     place = next(iter(metas))
     read = read_photos(photos, options, shelf, place, place.parent, lambda name: f"remove its frame from {place}")
     shots = iter(read)
@@ -224,10 +236,6 @@ def _photo(file: Path, frame: dict[str, Any], use: LensUse, counted: Counted | N
         raise ValueError(f"{file}: a frame lacks file_path or transform_matrix")
     name = frame["file_path"]
     what = f"{file}: {name}"
-    # Without a size in the frame, the lens needs the full image's, once that is found.
-    lens: Lens | Callable[[tuple[int, int]], Lens] = functools.partial(_lens, frame, what, use)
-    if all(frame.get(side) and lenient_number(frame[side], f"{what}: {side}") for side in "wh"):
-        lens = _lens(frame, what, use, (0, 0))
     path = file.parent / name
     images = file.parent / "images"
     return Photo(
@@ -235,7 +243,8 @@ def _photo(file: Path, frame: dict[str, Any], use: LensUse, counted: Counted | N
         _viewmat(frame["transform_matrix"], what),
         (path.parent, path.name),
         (images, path.relative_to(images).as_posix()) if path.is_relative_to(images) else None,
-        lens,
+        # Without a size in the frame, the lens needs the full image's, once that is found.
+        functools.partial(_lens, frame, what, use),
         what,
         mask=file.parent / frame["mask_path"] if frame.get("mask_path") else None,
         depths=file.parent / frame["depth_file_path"] if frame.get("depth_file_path") else None,

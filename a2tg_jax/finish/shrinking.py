@@ -208,39 +208,34 @@ def fewest_texels(textures: Textures, weights: Textures, most: int) -> list[Grou
             visible = squares.astype(np.float64).sum(axis=-1, keepdims=True) + LEAST_WEIGHT
             weighted = np.concatenate([texels.astype(np.float64), visible], axis=-1)
         start.append((ids, weighted))
-    start = _merged(start)
     # An empty first entry: concatenation needs one even if no texture can be halved.
     steps: list[tuple[np.ndarray, ...]] = [(np.zeros(0, int),) * 4]
     least = np.zeros(textures.num)
-    number = 0
-    tables = start
-    while tables:
+    # The textures before all steps, after the first one of each, and so on.
+    rows = [_merged(start)]
+    while rows[-1]:
         smaller: list[Group] = []
-        for ids, texels in tables:
+        for ids, texels in rows[-1]:
             for chosen, halved, cost in _halved_table(ids, texels):
                 saved = texels[0, ..., 0].size - halved[0, ..., 0].size
                 # A step counts at least as much as the one before it, so that it never comes first.
                 least[chosen] = np.maximum(least[chosen], cost / saved)
                 smaller.append((chosen, halved))
-                steps.append((chosen, np.full(len(chosen), number), least[chosen], np.full(len(chosen), saved)))
-        tables = _merged(smaller)
-        number += 1
+                steps.append((chosen, np.full(len(chosen), len(rows)), least[chosen], np.full(len(chosen), saved)))
+        rows.append(_merged(smaller))
     ids, numbers, costs, saved_texels = (np.concatenate(parts) for parts in zip(*steps, strict=True))
     order = np.lexsort((numbers, costs))  # By cost, and steps of one texture in their order.
-    excess = sum(texels[..., 0].size for _, texels in start) - most
+    excess = sum(texels[..., 0].size for _, texels in rows[0]) - most
     # + 1: the step that reaches the excess is included.
     count = int(np.searchsorted(np.cumsum(saved_texels[order]), excess)) + 1 if excess > 0 else 0
     # A texture takes its steps in order, so that their number says which.
-    rounds = np.bincount(ids[order[:count]], minlength=textures.num)
-    tables = start
-    for index in range(int(rounds.max(initial=0))):
-        moved: list[Group] = []
+    num_steps = np.bincount(ids[order[:count]], minlength=textures.num)
+    after_steps: list[Group] = []
+    for number, tables in enumerate(rows):
         for ids, texels in tables:
-            is_halved = rounds[ids] > index
-            moved.append((ids[~is_halved], texels[~is_halved]))
-            moved += [(chosen, halved) for chosen, halved, _ in _halved_table(ids[is_halved], texels[is_halved])]
-        tables = _merged(moved)
-    return [(ids, texels[..., :4]) for ids, texels in tables]
+            is_last = num_steps[ids] == number
+            after_steps.append((ids[is_last], texels[is_last, ..., :4]))
+    return _merged(after_steps)
 
 
 def _merged(tables: list[Group]) -> list[Group]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from a2tg_jax import Model, Origin, Similarity
 from a2tg_jax.base.atomic import write_whole
-from a2tg_jax.base.json_text import number_array
+from a2tg_jax.base.json_text import number_array, number_rows
 from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.text import shortened
 from a2tg_jax.core.origin import Color
@@ -134,16 +134,15 @@ def _edit_of(data: dict[str, Any]) -> Edit:
     if background is not None:
         red, green, blue = number_array(background, 3, "background").tolist()
         background = (red, green, blue)
+        if min(background) < 0 or max(background) > 1:
+            raise ValueError(f"background must be numbers from 0 to 1; got {background}")
     return Edit(crop, float(floaters), up, background, subject)
 
 
 def _box_of(crop: object) -> Box:
     if not isinstance(crop, dict):
         raise ValueError(f"crop must be an object; got {shortened(crop)}")
-    rows = crop.get("axes", np.eye(3).tolist())
-    if not isinstance(rows, list) or len(rows) != 3:
-        raise ValueError(f"crop.axes must be 3 directions; got {shortened(rows)}")
-    axes = np.stack([number_array(row, 3, "crop.axes") for row in rows])
+    axes = number_rows(crop.get("axes", np.eye(3)), 3, "crop.axes")
     check_similarity(Similarity(1.0, axes, np.zeros(3)), "crop.axes")
     low = number_array(crop.get("low"), 3, "crop.low", null=-math.inf)
     high = number_array(crop.get("high"), 3, "crop.high", null=math.inf)

@@ -23,7 +23,7 @@ from a2tg_jax.base.text import shortened
 from a2tg_jax.core.sh import NUM_BASES, SH_C0
 from a2tg_jax.io.columns import Ends, checked_shapes, dequantised, ends_of, log_exponents_of, quantised
 from a2tg_jax.io.gltf_container import Builder, Document, mesh_nodes, scene_of_one
-from a2tg_jax.io.model_rows import Rows, check_encodable, model_of, rows_of_model
+from a2tg_jax.io.model_rows import Rows, check_encodable, columns_of, model_of, rows_of_model
 from a2tg_jax.io.other_programs import (
     Ellipsoids,
     degree_to_read,
@@ -312,9 +312,7 @@ def _shown(document: Document, described: Mapping[str, Any], splats: Ellipsoids)
         sh = np.pad(sh, ((0, 0), (0, NUM_BASES[-1] - highest), (0, 0)))
     counts = [count for count in NUM_BASES if count <= sh.shape[1]]
     bands = [sh[degrees >= degree, count - 2 * degree - 1 : count] for degree, count in enumerate(counts)]
-    fields = (gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities)
-    means, quats, log_scales, logits = map(np.asarray, fields)
-    rows = Rows(means, quats, log_scales, logits, degrees, tuple(bands), sizes, texels, shapes)
+    rows = Rows(*columns_of(gaussians), degrees, tuple(bands), sizes, texels, shapes)
     return appearance, rows, base_degree
 
 

@@ -246,9 +246,11 @@ class Document:
         if not isinstance(uri, str):
             raise ValueError("the uri of a buffer is not text")
         if uri.startswith("data:"):
-            head, mark, text = uri.partition("base64,")
+            _, mark, text = uri.partition(";base64,")
+            if not mark:
+                raise ValueError("its embedded buffer is not base64, as glTF 2.0 has it; export it again")
             try:
-                return base64.b64decode(text, validate=True) if mark else urllib.parse.unquote_to_bytes(head[5:])
+                return base64.b64decode(text, validate=True)
             except binascii.Error as error:
                 raise ValueError(f"its embedded buffer is damaged ({error})") from error
         file = _named_file(self.path, uri)
@@ -261,9 +263,8 @@ class Document:
 def buffer_files(path: Path) -> list[Path]:
     """Return the files that the buffers of a *.gltf name; none if it cannot be read."""
     try:
-        buffers = Document(path).json["buffers"]
-        uris = {buffer["uri"]: None for buffer in buffers if not buffer.get("uri", "data:").startswith("data:")}
-        return list({_named_file(path, uri): None for uri in uris})
+        uris = [buffer.get("uri", "data:") for buffer in Document(path).json["buffers"]]
+        return list(dict.fromkeys(_named_file(path, uri) for uri in uris if not uri.startswith("data:")))
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return []
 

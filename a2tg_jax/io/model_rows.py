@@ -79,10 +79,15 @@ def rows_of_model(model: Model) -> Rows:
     if model.appearance.bands is not None:
         degrees = np.asarray(shown["degrees"], np.int64)
         bands += [shown[f"band_{degree}"] for degree in range(gaussians.sh_degree + 1, len(NUM_BASES))]
+    tables = (shown.get(name) for name in ("sizes", "texels", "shapes"))
+    return Rows(*columns_of(gaussians), degrees, tuple(bands), *tables)
+
+
+def columns_of(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the first four fields of `Rows`, as Gaussians have them."""
     fields = (gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities)
     means, quats, log_scales, logits = map(np.asarray, fields)
-    tables = (shown.get(name) for name in ("sizes", "texels", "shapes"))
-    return Rows(means, quats, log_scales, logits, degrees, tuple(bands), *tables)
+    return means, quats, log_scales, logits
 
 
 def ordered(rows: Rows, order: np.ndarray, *, turns: bool = True) -> Rows:

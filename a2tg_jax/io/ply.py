@@ -153,13 +153,14 @@ def encode_ply(
     parts = (positions, np.concatenate(columns, axis=1).astype("<f4"))
     # As bytes, since float64 positions and float32 columns share a row.
     rows = np.concatenate([np.ascontiguousarray(part).view(np.uint8) for part in parts], axis=1)
-    return _header(comments, [("vertex", gaussians.num, properties)]) + rows.tobytes()
+    header = ply_header([("vertex", gaussians.num, properties)], f"comment {FLAT_MARK}\n{comments}")
+    return header + rows.tobytes()
 
 
-def _header(comments: str, elements: Iterable[tuple[str, int, Iterable[tuple[str, str]]]]) -> bytes:
-    """Return the header of a file of flat splats, given name, number of rows, and types and names of the properties of
-    each element."""
-    lines = ["ply", "format binary_little_endian 1.0", f"comment {FLAT_MARK}", *comments.splitlines()]
+def ply_header(elements: Iterable[tuple[str, int, Iterable[tuple[str, str]]]], comments: str = "") -> bytes:
+    """Return the header of a binary file, given name, number of rows, and types and names of the properties of each
+    element."""
+    lines = ["ply", "format binary_little_endian 1.0", *comments.splitlines()]
     for element, num, properties in elements:
         lines.append(f"element {element} {num}")
         lines += [f"property {kind} {name}" for kind, name in properties]
@@ -401,5 +402,5 @@ def encode_packed_ply(placed: PlacedSplats) -> bytes:
     for element, attributes in names.items():
         if attributes:
             elements.append((element, counts[element], [(kinds[element], name) for name in attributes]))
-    header = _header(place_comments(placed.offset, placed.turn), elements)
+    header = ply_header(elements, f"comment {FLAT_MARK}\n{place_comments(placed.offset, placed.turn)}")
     return header + np.concatenate(bounds, axis=1).astype("<f4").tobytes() + vertices.tobytes() + codes.tobytes()

@@ -101,7 +101,7 @@ def load_sog(path: Path) -> Model:
 def sog_files(path: Path) -> list[Path]:
     """Return the files of an unbundled SOG, meta.json first; it alone if it cannot be read."""
     try:
-        header = parse_json(existing_bytes(path, "file"))
+        header = _checked_header(existing_bytes(path, "file"))
         return [path, *(path.parent / name for name in _named_pictures(header))]
     except (OSError, ValueError):
         return [path]

@@ -11,6 +11,7 @@ import numpy as np
 from a2tg_jax import Model
 from a2tg_jax.base.even_spacing import evenly_chosen
 from a2tg_jax.data.camera_paths import front_view
+from a2tg_jax.data.capture_geometry import camera_centers
 from a2tg_jax.io.columns import Choice, opacities_of
 from a2tg_jax.io.compact import CompactChoices, encode_model
 from a2tg_jax.io.edit_file import scores_of
@@ -95,9 +96,7 @@ def importance(model: Model) -> np.ndarray:
     areas: np.ndarray = opacities_of(np.asarray(gaussians.logit_opacities)) * np.exp(log_areas)
     if origin is None or not len(origin.viewmats):
         return areas
-    viewmats = evenly_chosen(origin.viewmats, MOST_CAMERAS)
-    # −Rᵀ·t.
-    centers = -np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3])
+    centers = camera_centers(evenly_chosen(origin.viewmats, MOST_CAMERAS))
     means = np.asarray(gaussians.means)
     squares = np.stack([np.sum((means - center) ** 2, axis=1) for center in centers])
     least = NEAREST * np.median(squares) if squares.size else 1.0

@@ -10,16 +10,17 @@ from PIL import Image
 
 from a2tg_jax import Origin, Similarity
 from a2tg_jax.base.atomic import replacing, write_whole
+from a2tg_jax.base.config_json import config_to_dict
 from a2tg_jax.base.regular_files import expanded
+from a2tg_jax.data.ply import RGB
 from a2tg_jax.io.gltf import OWN
 from a2tg_jax.io.gltf_container import Builder, scene_of_one
 from a2tg_jax.io.other_programs import linear_colors, matrix_of, upright
-from a2tg_jax.mesh.triangles import Mesh
+from a2tg_jax.io.ply import ply_header
+from a2tg_jax.mesh.triangles import Mesh, far_middle
 
 SUFFIXES = (".glb", ".ply", ".obj")
 JPEG_QUALITY = 92
-FAR = 100.0
-"""Distance from the origin, in extents, beyond which positions are relative to the middle, for float32."""
 
 
 def check_mesh_suffix(path: str | os.PathLike[str], name: str = "path") -> None:
@@ -77,10 +78,10 @@ def save_mesh(path: str | os.PathLike[str], mesh: Mesh, transform: Similarity | 
     kind = "<f8" if _needs_doubles(mesh.vertices) else "<f4"
     word = "float" if kind == "<f4" else "double"
     fields: list[Any] = [("positions", kind, 3)]
-    properties = [f"property {word} {axis}" for axis in "xyz"]
+    properties = [(word, axis) for axis in "xyz"]
     if mesh.colors is not None:
         fields.append(("colors", "u1", 3))
-        properties += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
+        properties += [("uchar", channel) for channel in RGB]
     rows = np.empty(mesh.num_vertices, fields)
     rows["positions"] = mesh.vertices
     if mesh.colors is not None:
@@ -89,11 +90,9 @@ def save_mesh(path: str | os.PathLike[str], mesh: Mesh, transform: Similarity | 
     faces = np.empty(mesh.num_faces, [("number", "u1"), ("corners", "<i4", 3)])
     faces["number"] = 3
     faces["corners"] = mesh.faces
-    header = [
-        "ply", "format binary_little_endian 1.0", f"element vertex {mesh.num_vertices}", *properties,
-        f"element face {mesh.num_faces}", "property list uchar int vertex_indices", "end_header", "",
-    ]  # fmt: skip
-    write_whole(path, "\n".join(header).encode() + rows.tobytes() + faces.tobytes())
+    corners = [("list uchar int", "vertex_indices")]
+    header = ply_header([("vertex", mesh.num_vertices, properties), ("face", mesh.num_faces, corners)])
+    write_whole(path, header + rows.tobytes() + faces.tobytes())
     return [path]
 
 
@@ -143,12 +142,11 @@ def _save_glb(path: Path, mesh: Mesh, origin: Similarity | Origin | None) -> Non
         raise ValueError("the mesh has no faces, and a GLB file needs one at least: write a PLY or OBJ file")
     builder = Builder()
     node: dict[str, Any] = {"name": "mesh", "mesh": 0}
-    middle = _middle(mesh.vertices) if transform is None else np.zeros(3)
+    middle = far_middle(mesh.vertices) if transform is None else np.zeros(3)
     if transform is not None:
         node["matrix"] = matrix_of(upright(origin, "y")).T.ravel().tolist()
-        if _middle(mesh.transform(transform.inverse()).vertices).any():
-            kept = {"scale": float(transform.scale), "rotation": np.asarray(transform.rotation).tolist()}
-            node["extras"] = {OWN: kept | {"translation": np.asarray(transform.translation).tolist()}}
+        if far_middle(mesh.transform(transform.inverse()).vertices).any():
+            node["extras"] = {OWN: config_to_dict(transform)}
     elif middle.any():
         node["translation"] = middle.tolist()
     attributes = {"POSITION": builder.add((mesh.vertices - middle).astype(np.float32), has_bounds=True)}
@@ -175,11 +173,3 @@ def _save_glb(path: Path, mesh: Mesh, origin: Similarity | Origin | None) -> Non
         described["samplers"] = [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}]
         described["textures"] = [{"source": 0, "sampler": 0}]
     builder.save(path, described)
-
-
-def _middle(vertices: np.ndarray) -> np.ndarray:
-    """Return the middle of positions far from the origin; otherwise zeros."""
-    low = vertices.min(axis=0)
-    high = vertices.max(axis=0)
-    middle = (low + high) / 2
-    return middle if np.abs(middle).max() > FAR * (high - low).max() else np.zeros(3)

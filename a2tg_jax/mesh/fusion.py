@@ -71,7 +71,7 @@ class Space:
         """Return positions [P, 3] of voxels in the world; indices may be fractions."""
         offset = indices.astype(jnp.float32) * self.voxel
         if self.is_unbounded:
-            ratio = jnp.maximum(jnp.linalg.norm(offset, axis=-1, keepdims=True) / self.radius, 1.0)
+            ratio = self._ratio(offset)
             offset = offset * (jnp.exp(ratio - 1) / ratio)
         return self.center[None] + offset
 
@@ -79,9 +79,13 @@ class Space:
         """Return the indices [P, 3] of positions, as fractions; the inverse of `positions`."""
         offset = points - self.center[None]
         if self.is_unbounded:
-            ratio = jnp.maximum(jnp.linalg.norm(offset, axis=-1, keepdims=True) / self.radius, 1.0)
+            ratio = self._ratio(offset)
             offset = offset * ((1 + jnp.log(ratio)) / ratio)
         return offset / self.voxel
+
+    def _ratio(self, offset: Array) -> Array:
+        """Return the lengths [P, 1] of offsets from the centre in radii, at least 1."""
+        return jnp.maximum(jnp.linalg.norm(offset, axis=-1, keepdims=True) / self.radius, 1.0)
 
     def radii(self, points: Array) -> Array:
         """Return the distances [P] of positions from the centre, in radii."""

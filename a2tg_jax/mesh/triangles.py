@@ -18,6 +18,8 @@ MOST_POINTS = 200_000_000
 """Largest number of sampled points, of 24 bytes each, twice that during sampling."""
 CHUNK = 1 << 20
 """Points that are placed at a time."""
+FAR = 100.0
+"""Distance from the origin, in extents, beyond which positions are relative to the middle, for float32."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -97,6 +99,14 @@ def largest_clusters(mesh: Mesh, most: int, least_faces: int) -> tuple[Mesh, int
     return mesh.with_faces(is_kept[cluster]), int((~is_kept).sum())
 
 
+def far_middle(vertices: np.ndarray) -> np.ndarray:
+    """Return the middle [3] of positions far from the origin; otherwise zeros."""
+    low = vertices.min(axis=0)
+    high = vertices.max(axis=0)
+    middle = (low + high) / 2
+    return middle if np.abs(middle).max() > FAR * (high - low).max() else np.zeros(3)
+
+
 def check_simplifying(num_faces: int) -> Any:
     """Return the library fast-simplification. ValueError: it is not installed, or there are fewer than 4 faces."""
     if num_faces < LEAST_FACES:
@@ -120,9 +130,11 @@ def simplify_mesh(mesh: Mesh, num_faces: int) -> Mesh:
     library = check_simplifying(num_faces)
     if mesh.num_faces <= num_faces:
         return mesh
+    middle = far_middle(mesh.vertices)
     vertices, faces = library.simplify(
-        np.asarray(mesh.vertices, np.float32), mesh.faces, target_reduction=1 - num_faces / mesh.num_faces
+        np.asarray(mesh.vertices - middle, np.float32), mesh.faces, target_reduction=1 - num_faces / mesh.num_faces
     )
+    vertices = vertices + middle
     if not len(faces):
         raise ValueError(f"no faces are left of {mesh.num_faces:,}: choose more faces than {num_faces:,}")
     # Decimation moves vertices and drops colours: each takes the nearest old one's.

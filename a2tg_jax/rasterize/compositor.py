@@ -14,6 +14,7 @@ from typing import Any, NoReturn
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
@@ -124,17 +125,27 @@ _composite_tiles = jax.custom_vjp(_forward, nondiff_argnums=(0,))
 def _composite_tiles_fwd(
     settings: PassSettings, inputs: PassInputs, jacobian: Array, probe: Array
 ) -> tuple[tuple[Array, Array], tuple[Any, ...]]:
+    """Return the images, and what the backward pass needs: of the images nothing if only colours are differentiated."""
+    M, _, opacities, normals, numbers = inputs.splats
+    others: Any = M, opacities, normals, numbers, inputs.texels, probe
+    only_colors = not any(leaf.perturbed for leaf in others)
+    inputs, jacobian, probe = jax.tree.map(lambda leaf: leaf.value, (inputs, jacobian, probe))
     images = _forward(settings, inputs, jacobian, probe)
-    return images, (inputs, jacobian, probe, images)
+    return images, (inputs, jacobian, probe, None if only_colors else images)
 
 
 def _composite_tiles_bwd(
     settings: PassSettings, residuals: tuple[Any, ...], cotangents: tuple[Array, Array]
 ) -> tuple[PassInputs, None, Array]:
-    inputs, jacobian, probe, (channels, transmittance) = residuals
-    g, g_transmittance = cotangents
-    # B of the whole list: Σ g·c·α·T over the splats is g·channels, and what is behind them has weight T.
-    suffix_sum = jnp.sum(g * channels, axis=1) + g_transmittance * transmittance
+    inputs, jacobian, probe, images = residuals
+    g, g_transmittance = map(_instantiated, cotangents)
+    if images is None:
+        settings = settings._replace(statistic=None, only_colors=True)
+        suffix_sum = jnp.zeros_like(g_transmittance)
+    else:
+        channels, transmittance = images
+        # B of the whole list: Σ g·c·α·T over the splats is g·channels, and what is behind them has weight T.
+        suffix_sum = jnp.sum(g * channels, axis=1) + g_transmittance * transmittance
     differentiated = inputs.splats, inputs.texels, probe
     results = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), differentiated)
     gradients = _by_platform("backward", settings, results, inputs, jacobian, probe, g, suffix_sum)
@@ -144,7 +155,12 @@ def _composite_tiles_bwd(
     return PassInputs(*d_inputs), None, d_probe
 
 
-_composite_tiles.defvjp(_composite_tiles_fwd, _composite_tiles_bwd)
+def _instantiated(cotangent: Any) -> Array:
+    is_zero = isinstance(cotangent, SymbolicZero)
+    return jnp.zeros(cotangent.shape, cotangent.dtype) if is_zero else cotangent
+
+
+_composite_tiles.defvjp(_composite_tiles_fwd, _composite_tiles_bwd, symbolic_zeros=True)
 
 
 def _by_platform(name: str, settings: PassSettings, results: Any, *arrays: object) -> Any:

@@ -246,17 +246,21 @@ def blend(
 def blend_vjp(
     functions: Elementwise, near_plane: float, planes: Planes, splat: Splat, lookup: Lookup | None, x: Array, y: Array,
     transmittance: Array, is_live: Array, suffix_sum: Array, g: Sequence[Array], has_rho: bool,
+    only_colors: bool,
 ) -> tuple[State, Array, Cotangents]:  # fmt: skip
     """Differentiate `blend`, with `suffix_sum` as for `absorb_vjp` and the cotangents g of the channels.
 
     Returns (transmittance, is_live, suffix_sum) behind the splat, its weight, and its Cotangents. These are valid only
-    if the weight is positive; elsewhere they may not even be finite.
+    if the weight is positive; elsewhere they may not even be finite. With `only_colors`, only the colours have
+    any that are not zero, and nothing depends on `suffix_sum`.
     """
 
     def of_floats(
         planes: Planes, opacity: Array, color: Triple, normal: Triple | None, numbers: tuple[Array, ...],
         values: tuple[Array, ...], rho_probe: Array | None,
     ) -> Shown:  # fmt: skip
+        if only_colors:
+            planes, opacity, normal, numbers, values = jax.lax.stop_gradient((planes, opacity, normal, numbers, values))
         hit = intersect(planes, x, y, near_plane, functions.has_low_pass)
         values = values_at(functions, lookup, hit, values)
         return show(functions, Splat(splat.M, opacity, color, normal, numbers), hit, values, rho_probe)

@@ -55,6 +55,7 @@ class PassSettings(NamedTuple):
     near_plane: float  # least depth of visible hits
     has_geometry: bool  # whether depth, squared depth and normals are composited as well
     statistic: Statistic | None = None  # computed by the backward pass for densification
+    only_colors: bool = False  # whether the backward pass is for the colours alone; all other gradients are then zero
     has_rays: bool = False  # whether pixels have rays of their own (`tile_pixels`)
     compositor: CompositorChoice = "auto"
     tile_batch: int | None = None

@@ -25,12 +25,19 @@ def training_command(run: RunFolder, out: str, *flags: str) -> str:
     return shlex.join(["a2tg", "train", "--config", str(run.record), *flags, "--out", out])
 
 
+def beside(run: RunFolder, what: str) -> str:
+    """Return the path of another run folder next to one, with an addition to its name."""
+    # "." and ".." have no name to add to.
+    path = run.path if run.path.name not in ("", "..") else run.path.resolve()
+    return f"{path}-{what}"
+
+
 def repeating_command(run: RunFolder) -> str:
     """Return the command that repeats a run, and its finishing, if any."""
-    again = f"{run.path}-again"
+    again = beside(run, "again")
     if not is_regular(run.finish):
         return training_command(run, again)
-    trained = f"{run.path}-trained"
+    trained = beside(run, "trained")
     options = config_to_dict(read_finish(run))
     flags = [f"--{name.replace('_', '-')}={value}" for name, value in options.items()]
     finishing = shlex.join(["a2tg", "finish", trained, "--out", again, *flags])

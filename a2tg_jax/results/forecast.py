@@ -18,6 +18,7 @@ from a2tg_jax.results.plan import RunPlan
 from a2tg_jax.results.record import MEMORY_OF_FILE, RunRecord
 from a2tg_jax.training.cost import STATES, StageForecast, fed_bytes, forecast_stages, held_bytes
 from a2tg_jax.training.options import SENSIBLE_GAUSSIANS
+from a2tg_jax.training.reports import saved_work
 
 KEPT_STATES = 3
 """Number of checkpoints on disk while a new one is written."""
@@ -181,7 +182,10 @@ def time_after(
     for index, name in enumerate(names):
         later = names[index + 1 :]
         # An iteration of a later stage is taken to last as long as one of this stage, and a step to compile as long.
-        iterations = sum(plan[other].stage.iterations for other in later)
+        iterations = 0.0
+        for other in later:
+            stage = plan[other].stage
+            iterations += stage.iterations - saved_work(scene.train) * stage.num_coarse
         num_programs: float = sum(stages[other].num_programs for other in later)
         num_programs += DRAWING_PROGRAM * len(plan.names) + PAGES
         largest = max((stages[other].model_bytes for other in later), default=0)

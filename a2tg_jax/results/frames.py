@@ -38,6 +38,9 @@ FRAME_PIXELS = 1280 * 720
 """Default width × height of frames, which have the photographs' aspect."""
 SUBJECT_SHARE = 0.9
 """Largest share of the width and height of an orbit's frames that the subject takes."""
+LEAST_ROOM = 0.25
+"""Smallest distance of an orbit's principal point from a border, as a share of the width or height; a nearer one, as
+cropped photographs have it, would leave no focal length that shows the whole subject."""
 LARGEST_SIDE = 8192
 WEBP_QUALITY = 80
 LIST = ".a2tg-frames"
@@ -255,7 +258,7 @@ def widen_camera(camera: Camera, width: int, height: int) -> Camera:
 
 def with_whole_subject(cameras: Sequence[Camera], model: Model) -> list[Camera]:
     """Return an orbit's cameras with one focal length, at most theirs, at which each shows the whole subject; unchanged
-    if the model has no subject.
+    if the model has no subject. A principal point near a border (`LEAST_ROOM`) moves to the middle.
 
     An orbit looks at the point that most photographs aim at, which need not be the middle of the subject.
     """
@@ -264,6 +267,7 @@ def with_whole_subject(cameras: Sequence[Camera], model: Model) -> list[Camera]:
     except ValueError:
         return list(cameras)
     points = np.asarray(model.live.gaussians.means, np.float64)[is_kept]
+    cameras = [_with_room(camera) for camera in cameras]
     factor = 1.0
     for camera in cameras:
         viewmat = np.asarray(camera.viewmat, np.float64)
@@ -276,6 +280,14 @@ def with_whole_subject(cameras: Sequence[Camera], model: Model) -> list[Camera]:
         room = np.where(offsets < 0, K[:2, 2], sizes - K[:2, 2]) - (1 - SUBJECT_SHARE) / 2 * sizes
         factor = min(factor, (room / np.maximum(np.abs(offsets), 1e-9)).min(initial=1.0))
     return [dataclasses.replace(camera, K=camera.K.at[:2, :2].multiply(factor)) for camera in cameras]
+
+
+def _with_room(camera: Camera) -> Camera:
+    """Return the camera, with its principal point in the middle of the image if it is near a border."""
+    sizes = np.array([camera.width, camera.height])
+    if (np.abs(np.asarray(camera.K)[:2, 2] / sizes - 0.5) <= 0.5 - LEAST_ROOM).all():
+        return camera
+    return dataclasses.replace(camera, K=camera.K.at[:2, 2].set(sizes / 2))
 
 
 def _numbered(path: Sequence[Camera]) -> dict[str, Camera]:

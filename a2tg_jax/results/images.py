@@ -95,7 +95,7 @@ def side_by_side(images: Sequence[np.ndarray], captions: Sequence[str]) -> Image
 
 
 def picture_names(view_names: Iterable[str]) -> dict[str, str]:
-    """Return file names of the views' pictures, unique regardless of case; folders become part of the name.
+    """Return file names of the views' pictures, on one line and unique regardless of case; folders become a part.
 
     Long names are cut and end in a hash. If two names would be equal, as for a/b.png and a_b.jpg, the later in sorted
     order gets a number.
@@ -103,7 +103,8 @@ def picture_names(view_names: Iterable[str]) -> dict[str, str]:
     names: dict[str, str] = {}
     taken: set[str] = set()
     for view_name in sorted(view_names):
-        stem = os.path.splitext(view_name)[0].replace("/", "_")
+        # Lists of files have a name on each line.
+        stem = "_".join(os.path.splitext(view_name)[0].replace("/", "_").splitlines())
         data = stem.encode(errors="surrogatepass")
         if len(data) > LONGEST_STEM:
             # ignore drops a character that the cut divided.

@@ -143,10 +143,10 @@ def _shown(run: RunFolder, plan: RunPlan) -> str | None:
 
 
 def facts_or_damage(run: RunFolder) -> dict[str, Any]:
-    """Return the content of a run folder, or only its path and damage if run.toml cannot be read."""
+    """Return the content of a run folder, or only its path and damage if a file cannot be read."""
     try:
         return run_facts(run)
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         return {"path": str(run.path), "damage": str(error)}
 
 

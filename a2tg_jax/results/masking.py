@@ -10,12 +10,12 @@ from PIL import Image
 
 from a2tg_jax import Renderer, resize_camera
 from a2tg_jax.base.text import counted
-from a2tg_jax.data.load import SceneSource
+from a2tg_jax.data.load import SceneSource, names_below_images
 from a2tg_jax.host.progress_bars import progress_over
 from a2tg_jax.io.edit_file import Edit, kept_by, load_edit
 from a2tg_jax.io.subject import find_subject
 from a2tg_jax.render import with_features
-from a2tg_jax.results.commands import training_command
+from a2tg_jax.results.commands import beside, training_command
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.images import save_picture
 from a2tg_jax.results.model_source import open_source
@@ -42,7 +42,8 @@ def write_masks(
       overwrite: replace masks that exist.
 
     Raises:
-      ValueError: if the model has no subject, or the scene is built in.
+      ValueError: if the model has no subject, or training reads no masks for the photographs of this scene, such as a
+        built-in one, or one whose photographs are not in a folder images.
       OSError: if photographs are missing, or a mask exists.
     """
     chosen = Edit(subject=True) if edit is None else load_edit(edit)
@@ -63,7 +64,8 @@ def write_masks(
     views = [view for view in (*photographs.train, *photographs.test) if view.name in viewmats]
     if not views:
         raise ValueError(f"{record.scene.path}: the model was trained on none of its photographs; give their run")
-    files = [out / f"{view.name.removeprefix('images/')}.png" for view in views]
+    names = names_below_images(Path(record.scene.path), [view.name for view in views])
+    files = [out / f"{name}.png" for name in names]
     for file in files:
         check_new(file, "`out`", overwrite=overwrite)
     weights = jnp.asarray(is_kept[:, None], model.gaussians.means.dtype)
@@ -81,7 +83,7 @@ def write_masks(
         save_picture(file, np.uint8(255) * is_white)
         covered.append(100 * is_white.mean())
     what = "what the edit keeps" if subject is None else f"the subject ({subject.words})"
-    train = training_command(run, f"{run.path}-subject", "--mask-as", "background")
+    train = training_command(run, beside(run, "subject"), "--mask-as", "background")
     return (
         f"wrote {counted(len(files), 'mask')} to {out}/: {what} covers {np.mean(covered):.0f} % of the photographs, "
         f"{min(covered):.0f} to {max(covered):.0f} % of each\n"

@@ -134,8 +134,11 @@ def is_same_so_far(a: System, b: System, index: int) -> bool:
 
 def is_equal(a: Stage, b: Stage) -> bool:
     """Return whether two stages are equal in everything, arrays and classes included."""
+    beside = [field.name for field in dataclasses.fields(Stage) if field.metadata.get("beside")]
+    if any(getattr(a, name) != getattr(b, name) for name in beside):
+        return False
     # jax.tree compares classes and static fields; arrays are leaves, which == does not reduce to one bool.
-    if a.name != b.name or jax.tree.structure(a) != jax.tree.structure(b):  # type: ignore[operator]
+    if jax.tree.structure(a) != jax.tree.structure(b):  # type: ignore[operator]
         return False
     pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
     return all(np.array_equal(np.asarray(x), np.asarray(y)) for x, y in pairs)

@@ -2,7 +2,7 @@
 
 It is kept as run.toml. A configuration file has the same keys; missing ones have the command line's defaults:
 
-    scene = "../scenes/fox"              # relative to the file's folder; or s3://bucket/fox, or built in: "cells"
+    scene = "../scenes/fox"              # relative to the file's folder; or built in: "cells"
     downscale = 2
     system = "a2tg"                      # or package.module:NAME
     preset = "quick"
@@ -33,8 +33,8 @@ import tomli_w
 from a2tg_jax import Bytewise, System, find_system, like
 from a2tg_jax.base.atomic import write_whole
 from a2tg_jax.base.config_json import changed_config, config_from_dict, config_to_dict, flatten_config, merged
-from a2tg_jax.base.json_text import MOST_TOML_BYTES, parse_toml
-from a2tg_jax.base.regular_files import expanded, is_regular, read_regular
+from a2tg_jax.base.json_text import read_toml
+from a2tg_jax.base.regular_files import expanded, is_regular
 from a2tg_jax.base.text import MEGABYTE, budget_in_bytes, did_you_mean, megabytes_of, shortened
 from a2tg_jax.data.load import SceneSource
 from a2tg_jax.io.model_rows import check_encodable
@@ -220,10 +220,7 @@ def read_run_file(path: Path) -> RunRecord:
     if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such configuration file")
     where = f"{path}:"
-    try:
-        table = parse_toml(read_regular(path, MOST_TOML_BYTES))
-    except ValueError as error:
-        raise ValueError(f"{path}: is not valid TOML: {shortened(str(error), 200)}") from error
+    table = read_toml(path)
     for key in table:
         if key not in KEYS:
             raise ValueError(f"{where} {shortened(key)} is an unknown key{did_you_mean(key, KEYS)}")

@@ -170,10 +170,12 @@ class LiveView:
         status: dict[str, Any] = {"stage": f"{run.stage.name}{left}", "iterations": run.stage.iterations}
         history = run.history  # Assembling a long history takes time.
         if len(history.iteration):
+            psnr = float(history.psnr[-1])
             status |= {
                 "iteration": int(history.iteration[-1]),
                 "loss": float(history.loss[-1]),
-                "psnr": float(history.psnr[-1]),
+                # JSON has no infinity, the PSNR of equal pictures.
+                "psnr": psnr if math.isfinite(psnr) else None,
                 "num": int(history.num_gaussians[-1]),
                 "bytes": float(history.megabytes[-1]) * 1e6,
             }

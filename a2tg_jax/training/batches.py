@@ -26,9 +26,16 @@ ROOM_AHEAD = 2**28
 MOST_AHEAD = 10
 """Largest number of prepared batches."""
 
+LEAST_HALVED = 128
+"""Least width and height of photographs that are halved in a stage's first iterations, in pixels."""
 BYTES_PER_DEPTH = 4
 ALIGNMENT = 64
 """Alignment in bytes of memory that XLA adopts."""
+
+
+def can_halve(size: tuple[int, int]) -> bool:
+    """Return whether photographs of a height and width are halved in a stage's first iterations; small ones are not."""
+    return min(size) >= LEAST_HALVED
 
 
 class Photographs(NamedTuple):

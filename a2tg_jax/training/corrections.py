@@ -256,9 +256,10 @@ def corrected_origin(origin: Origin, corrections: Sequence[Correction], states: 
         of_test_views = np.broadcast_to(correction.neutral, (num_test, *learned_rows.shape[1:]))
         rows[correction.name] = np.concatenate([learned_rows, of_test_views.astype(learned_rows.dtype)])
     viewmats = origin.viewmats.copy()
+    cameras = origin.cameras
     for index in np.flatnonzero(~origin.is_test):
         of_view = [jnp.asarray(rows[correction.name][index]) for correction in corrections]
-        viewmats[index] = corrected_camera(corrections, of_view, origin.cameras[index]).viewmat
+        viewmats[index] = corrected_camera(corrections, of_view, cameras[index]).viewmat
     return dataclasses.replace(origin, viewmats=viewmats, corrections=rows)
 
 

@@ -15,7 +15,7 @@ from a2tg_jax.events import HostEvent
 from a2tg_jax.scene import Scene, View, ray_bytes
 from a2tg_jax.training.batches import plan_batches, view_bytes
 from a2tg_jax.training.options import System
-from a2tg_jax.training.reports import RestOfRun
+from a2tg_jax.training.reports import RestOfRun, saved_work
 from a2tg_jax.training.start import initial_number, rows_needed
 
 STATES = 3
@@ -76,11 +76,11 @@ def forecast_stages(
             shared = stage.shared_bytes
         model_bytes = BYTES_PER_FLOAT * (own_floats + floats) * num + shared
         for event in stage.events:
-            model_bytes = event.most_bytes(model_bytes, num, stage.iterations)
+            model_bytes = float(event.most_bytes(model_bytes, num, stage.iterations))
         floats = (model_bytes - shared) / BYTES_PER_FLOAT / num - own_floats
         on_host = [event for event in stage.events if isinstance(event, HostEvent)]
         # One for halved photographs, and one for whole ones.
-        num_programs = 2 if stage.num_coarse else 1
+        num_programs = 2 if stage.num_coarse and saved_work(scene.train) else 1
         num_programs += sum(event.num_programs(stage.iterations) for event in on_host)
         # An event has the old state and the new one; later, the devices get their shares.
         is_changed = any(event.times(stage.iterations) for event in on_host)

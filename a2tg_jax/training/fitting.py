@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from a2tg_jax.base.checks import check_kind, check_untraced, kind_of
+from a2tg_jax.base.checks import check_int, check_kind, check_untraced, kind_of
 from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.text import counted, in_bytes, shortened
 from a2tg_jax.core.budget import LARGEST_SHORTFALL
@@ -252,8 +252,8 @@ def _check_arguments(
         }
         hint = next((text for cls, text in hints.items() if isinstance(start, cls)), "")
         check_kind("start", start, Model, hint)
-    if checkpoint_every is not None and checkpoint_every < 1:
-        raise ValueError(f"checkpoint_every must be at least 1; got {checkpoint_every}")
+    if checkpoint_every is not None:
+        check_int("checkpoint_every", checkpoint_every, 1)
     if progress is True:
         raise ValueError("progress must be None, or a class such as a2tg_jax.ProgressBar; got True")
     system.check()

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.appearance import Appearance, check_is_appearance
+from a2tg_jax.appearance.base import num_colors_of
 from a2tg_jax.base.checks import check_literal, kind_of, short_repr
 from a2tg_jax.core.cameras import Camera, check_camera
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
@@ -66,7 +67,7 @@ def view_gradients(
       loss: of the model, for regularisers, and of the view; a scalar.
       model: differentiated in all its floats.
       camera: the view.
-      background: [3] colour; None is the model's own.
+      background: [3] colour, or as many numbers as a splat has; None is the model's own, or 0 for other than three.
       settings: with a capacity under jit (`plan_render`); an eager call finds its own.
       has_geometry: if False, depth, normal and distortion cost nothing, and reading them raises ValueError.
       sh_degree: overrides the settings' degree; may be traced.
@@ -89,11 +90,11 @@ def view_gradients(
     """
     check_literal("statistic", statistic, Statistic)
     check_is_model(model)
-    background = model.background if background is None else background
     check_gaussians(model.gaussians, "model.gaussians")
     check_is_appearance(model.appearance, model.gaussians)
     check_camera(camera)
-    background = background_array(background, model.gaussians)
+    background = model.default_background if background is None else background
+    background = background_array(background, model.gaussians, num_colors_of(model.appearance))
     settings = with_capacity(settings, model.gaussians, camera, model.appearance, model.num_live)
 
     def of_view(model: Model, view: TracedView, output: RenderOutput) -> tuple[Array, RenderOutput]:

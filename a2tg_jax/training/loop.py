@@ -27,14 +27,14 @@ from a2tg_jax.parallel import any_process, divided, everywhere, mesh_of, num_pro
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.room import TileRoom, most_pairs
 from a2tg_jax.scene import Scene
-from a2tg_jax.training.batches import BatchOrder, PhotoStore
+from a2tg_jax.training.batches import BatchOrder, PhotoStore, can_halve
 from a2tg_jax.training.checkpoint import Checkpoint, Interrupted, state_of_checkpoint
 from a2tg_jax.training.cost import check_step_fits
 from a2tg_jax.training.divergence import DivergedError, largest_loss, what_diverged
 from a2tg_jax.training.history import COLUMNS, History
 from a2tg_jax.training.options import System
 from a2tg_jax.training.recorded_views import RecordedViews
-from a2tg_jax.training.reports import Display, LearningCheck, Pace, Progress, StageEffects
+from a2tg_jax.training.reports import Display, LearningCheck, Pace, Progress, StageEffects, saved_work
 from a2tg_jax.training.returned import calling, checked_change
 from a2tg_jax.training.start import state_of_model
 from a2tg_jax.training.step import (
@@ -64,8 +64,6 @@ LEAST_SHORTENED = 100
 """Smallest number of these steps, if as many iterations are left."""
 GROWTH_ROOM = 1.5
 """Pairs that lists may reach while a model is trained, as a multiple of the present ones."""
-LEAST_HALVED = 128
-"""Least width and height of photographs that are halved in a stage's first iterations, in pixels."""
 
 Size = tuple[int, int]
 """Height and width of a view, in pixels."""
@@ -341,10 +339,10 @@ class StageRun:
 
     def _pace_from(self, iteration: int) -> Pace:
         most = max((event.most_gaussians or 0 for event in self.stage.events), default=0)
-        num_halved = self.stage.num_coarse if self._is_halved(1) else 0
         return Pace(
-            iteration, self.stage.iterations, most_gaussians=most, num_halved=num_halved, after=self._progress.after
-        )
+            iteration, self.stage.iterations, most_gaussians=most, num_coarse=self.stage.num_coarse,
+            saved=saved_work(self.views), after=self._progress.after,
+        )  # fmt: skip
 
     def _log(self, iteration: int, info: StepInfo, on_log: OnLog | None) -> None:
         """Add a row to the history."""
@@ -435,7 +433,7 @@ class StageRun:
 
     def _is_halved(self, iteration: int) -> bool:
         """Return whether the photographs of an iteration are halved; small ones never are."""
-        return iteration <= self.stage.num_coarse and min(self._size(iteration)) >= LEAST_HALVED
+        return iteration <= self.stage.num_coarse and can_halve(self._size(iteration))
 
     def render_settings(self, size: Size, *, is_halved: bool) -> RenderSettings:
         """Return settings with a capacity for the views of a size, drawn at half of it or whole. The first call plans

@@ -8,7 +8,7 @@ import dataclasses
 import datetime
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple, Self
 
 import jax
@@ -19,7 +19,7 @@ from jax import Array
 from a2tg_jax.base.text import counted
 from a2tg_jax.events import Change, HostEvent, Times
 from a2tg_jax.scene import View, view_image
-from a2tg_jax.training.batches import BatchOrder
+from a2tg_jax.training.batches import BatchOrder, can_halve
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Background, Stage
 from a2tg_jax.training.step import TrainState
@@ -92,12 +92,14 @@ class Pace:
 
     def __init__(
         self, first: int, total: int, now: Callable[[], float] = time.perf_counter, *, most_gaussians: int = 0,
-        num_halved: int = 0, after: RestOfRun = RestOfRun(),  # noqa: B008 - immutable
+        num_coarse: int = 0, saved: float = 0.0, after: RestOfRun = RestOfRun(),  # noqa: B008 - immutable
     ):  # fmt: skip
         """`first` iterations were done before, `total` is the last one, and `now` is a clock in seconds. Gaussians grow
-        to at most `most_gaussians`; 0: they do not. In the first `num_halved` iterations photographs are halved."""
+        to at most `most_gaussians`; 0: they do not. In the first `num_coarse` iterations photographs may be halved,
+        which saves a share `saved` (`saved_work`) of their time."""
         self._total = total
-        self._num_halved = num_halved
+        self._num_coarse = num_coarse
+        self._saved = saved
         self._now = now
         self._most = most_gaussians
         self._after = after
@@ -152,8 +154,14 @@ class Pace:
 
     def _work_of(self, first: int, last: int) -> float:
         """Return the work of the iterations after `first` up to `last`, in iterations with whole photographs."""
-        num_halved = min(last, self._num_halved) - min(first, self._num_halved)
-        return last - first - (1 - HALVED_WORK) * num_halved
+        num_coarse = min(last, self._num_coarse) - min(first, self._num_coarse)
+        return last - first - self._saved * num_coarse
+
+
+def saved_work(views: Sequence[View]) -> float:
+    """Return the share of an iteration's time that halved photographs save, as a mean over views: small ones are not
+    halved."""
+    return (1 - HALVED_WORK) * float(np.mean([can_halve(view.picture.size) for view in views]))
 
 
 CHECKED_AFTER = 0.2

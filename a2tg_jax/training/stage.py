@@ -17,7 +17,8 @@ from jax import Array
 
 from a2tg_jax.appearance import Appearance, allocate_appearance, count_floats
 from a2tg_jax.appearance.base import check_appearance
-from a2tg_jax.base.checks import check_kind, check_literals, check_number, fields_of, kind_of
+from a2tg_jax.base.checks import check_kind, check_number, fields_of, kind_of
+from a2tg_jax.base.config_json import check_config
 from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.text import shortened
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
@@ -208,7 +209,7 @@ class Stage(NamedFields):
         parts: tuple[Event | Correction, ...] = (*self.events, *self.corrections)
         for part in parts:
             with fields_of(f"{where} {type(part).__name__}"):
-                check_literals(part)
+                check_config(part)
                 part.check_options()
         for event in self.events:
             name = f"{where} {type(event).__name__}"

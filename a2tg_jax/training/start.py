@@ -155,7 +155,8 @@ def given_model(start: Model, scene: Scene, system: System, index: int) -> Model
     """
     with fields_of("start"):
         check_model(start)
-    start = start.live
+    # Tables are rebuilt, because in training the block of Gaussian i is in row i (`Table.gather`).
+    start = start[:]
     stages = system.all_stages()
     stage = stages[index]
     degree = system.initial_sh_degree

@@ -304,7 +304,9 @@ def batch_gradients(
         # PSNR is of what a screen shows; the loss is of unclipped colours (`losses`).
         error = jnp.mean((jnp.clip(output.color, 0, 1) - target.image) ** 2)
         if mask is not None:  # The mean over the pixels that count; the error of the others is 0.
-            error = error / jnp.mean(mask.astype(error.dtype))
+            share = jnp.mean(mask.astype(error.dtype))
+            # No pixel of a halved photograph may count.
+            error = error / jnp.maximum(share, 1 / mask.size)
         return value, (error, output.overflow, parts_by_name)
 
     def gradients_of(model: Model, arrays: tuple[Any, ...]) -> BatchGradients:

@@ -14,7 +14,7 @@ from typing import Any
 
 import a2tg_jax as a2tg
 from a2tg_jax.base.config_json import changed_config, merged
-from a2tg_jax.base.json_text import read_json
+from a2tg_jax.base.json_text import read_json, read_toml
 from a2tg_jax.base.text import MEGABYTE, did_you_mean
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from lab.grid_file import (
@@ -27,7 +27,6 @@ from lab.grid_file import (
     blocks_of,
     method_tables,
     read_grid_file,
-    read_toml,
     shared_scale,
 )
 from lab.jobs import Job, Record
@@ -262,7 +261,7 @@ def read_grid(
 
 def has_scale(name: str, scale: str) -> bool:
     """Return whether a grid has a scale."""
-    return getattr(read_grid_file(grid_path(name)), scale) is not None
+    return scale in read_grid_file(grid_path(name)).scales
 
 
 def grid_path(name: str) -> Path:

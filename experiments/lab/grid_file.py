@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from a2tg_jax.base.config_json import config_from_dict
-from a2tg_jax.base.json_text import MOST_TOML_BYTES, parse_toml
-from a2tg_jax.base.regular_files import read_regular
-from a2tg_jax.base.text import shortened
+from a2tg_jax.base.json_text import read_toml
+from a2tg_jax.base.text import did_you_mean, shortened
 
 GRIDS = Path(__file__).resolve().parents[1] / "grids"
 SUFFIX = ".toml"
@@ -73,16 +72,8 @@ class GridFile:
     at_equal_bytes: tuple[str, ...] = ()
     at_equal_time: tuple[str, ...] = ()
     variants: dict[str, Any] = dataclasses.field(default_factory=dict)
-    claims: dict[str, Any] | None = None
-    full: dict[str, Any] | None = None
-    full_size: dict[str, Any] | None = None
-    half_size: dict[str, Any] | None = None
-    long: dict[str, Any] | None = None
-    paper160: dict[str, Any] | None = None
-    protocol: dict[str, Any] | None = None
-    protocol160: dict[str, Any] | None = None
-    small: dict[str, Any] | None = None
-    smoke: dict[str, Any] | None = None
+    scales: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Tables of the scales that it has; in the file each is a table of its own."""
 
     def scale(self, name: str, place: str) -> Scale:
         """Return the table of a scale.
@@ -90,10 +81,10 @@ class GridFile:
         Raises:
           ValueError: if there is none, or it has a mistake.
         """
-        if getattr(self, name) is None:
-            found = ", ".join(f"[{known}]" for known in SCALES if getattr(self, known) is not None) or "none"
+        if name not in self.scales:
+            found = ", ".join(f"[{known}]" for known in self.scales) or "none"
             raise ValueError(f"{place} has no table of --scale {name}, [{name}]; it has {found}")
-        return part_as(Scale, getattr(self, name), f"{place}: {name}")
+        return part_as(Scale, self.scales[name], f"{place}: {name}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,19 +99,6 @@ class MethodTable:
     by_number: bool = False
     chosen_in: str | None = None
     """JSON file beside the grids with the label of a method for each scene."""
-
-
-def read_toml(path: Path) -> dict[str, Any]:
-    """Return the content of a TOML file.
-
-    Raises:
-      FileNotFoundError: if there is none.
-      ValueError: naming the file, if it is no TOML.
-    """
-    try:
-        return parse_toml(read_regular(path, MOST_TOML_BYTES))
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
 
 
 def table_as(kind: type[TableT], table: Any, where: str, **given: Any) -> TableT:
@@ -147,7 +125,13 @@ def read_grid_file(path: Path) -> GridFile:
       FileNotFoundError: if there is none.
       ValueError: naming file and key, if a key is missing, unknown or of another type.
     """
-    return table_as(GridFile, read_toml(path), f"{path.name}:")
+    table = read_toml(path)
+    known = [*SCALES, *(field.name for field in dataclasses.fields(GridFile) if field.name != "scales")]
+    for key in table:
+        if key not in known:
+            raise ValueError(f"{path.name}: {shortened(key)} is an unknown key{did_you_mean(key, known)}")
+    scales = {name: table.pop(name) for name in SCALES if name in table}
+    return table_as(GridFile, table, f"{path.name}:", scales=scales)
 
 
 def shared_scale(name: str) -> Scale:

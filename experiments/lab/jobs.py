@@ -22,9 +22,8 @@ from a2tg_jax.base.json_text import read_json
 from a2tg_jax.base.memory import tidy_memory
 from a2tg_jax.base.threads import num_threads
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
-from a2tg_jax.core.gaussians import floats_per_gaussian, no_rows
+from a2tg_jax.core.gaussians import floats_per_gaussian
 from a2tg_jax.core.origin import WHITE
-from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.data.assembly import with_validation_views
 from a2tg_jax.data.load import SceneSource
 from a2tg_jax.data.synthetic import BUILT_IN
@@ -104,6 +103,12 @@ class Job:
         return tuple(job.iterations for job in self.chain)
 
     @property
+    def model_bytes(self) -> float:
+        """Return the bytes of its model: its budget, or its Gaussians with all floats."""
+        budget = self.system.budget_bytes
+        return model_bytes(self.system) if budget is None else budget
+
+    @property
     def key(self) -> str:
         """Return a unique key that is a valid file name."""
         return _key(self)
@@ -138,21 +143,14 @@ def num_gaussians(system: a2tg.System) -> int:
 def model_bytes(system: a2tg.System) -> float:
     """Return the bytes of the largest model of a system's stages; only shapes are computed, no device is used."""
     num = num_gaussians(system)
-    bases = NUM_BASES[system.initial_sh_degree]
     largest = 0.0
     for stage in system.stages():
-        # Bands begin empty, and their places cannot be traced.
-        allocate = functools.partial(_shown_by_one, dataclasses.replace(stage.appearance, bands=None), bases)
-        shown = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(jax.eval_shape(allocate)))
-        size = BYTES_PER_FLOAT * num * float(floats_per_gaussian(system.initial_sh_degree) + shown)
+        floats = floats_per_gaussian(system.initial_sh_degree) + stage.floats_shown
+        size = BYTES_PER_FLOAT * num * floats + stage.shared_bytes
         for event in stage.events:
             size = event.most_bytes(size, num, stage.iterations)
         largest = max(largest, size)
     return largest
-
-
-def _shown_by_one(appearance: a2tg.Appearance, num_bases: int) -> Any:
-    return a2tg.partition(a2tg.allocate_appearance(appearance, jax.random.key(0), no_rows(1, num_bases)))[0]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -176,10 +174,6 @@ class Folders:
 
     def record(self, job: Job) -> Path:
         return self.work / "records" / f"{job.key}.json"
-
-    def former_checkpoint(self, job: Job) -> Path:
-        """Return the checkpoint of a sweep begun when checkpoints had no iteration in their names."""
-        return self.work / "checkpoints" / f"{job.key}.npz"
 
     def time_so_far(self, job: Job) -> Path:
         """Return the file with the training time up to the newest checkpoint."""
@@ -259,9 +253,6 @@ def _train(job: Job, folders: Folders, scene: a2tg.Scene, stop_at: float) -> tup
                 session=_session(),
             )
 
-    former = folders.former_checkpoint(job)
-    if former.is_file():
-        former.replace(folders.files.checkpoint(job.key, 0))  # Any other checkpoint is newer.
     result = train_stage(folders.files, job.planned, scene, fit, on_resume=take_time, on_checkpoint=keep_time)
     return result, None if math.isnan(training.seconds) else training.seconds
 

@@ -11,7 +11,7 @@ from a2tg_jax.base.threads import num_threads
 from a2tg_jax.data.synthetic import BUILT_IN
 from a2tg_jax.events import HostEvent
 from lab.grid import Grid, Run
-from lab.jobs import Folders, Job, Record, model_bytes, num_gaussians
+from lab.jobs import Folders, Job, Record, num_gaussians
 from lab.markdown import table
 from lab.queue import estimated_bytes
 from lab.stages import Stage, runs_by_cell, scene_text, stages_of
@@ -182,18 +182,12 @@ def num_programs(job: Job) -> int:
 
 def _room(left: Sequence[Stage], folders: Folders, machine: Machine) -> str:
     """Return disk and memory in words."""
-    disk = sum(model_size(stage.job) for stage in left)
+    disk = sum(stage.job.model_bytes for stage in left)
     memory = max(estimated_bytes(stage.job) for stage in left)
     return (
         f"Disk: about {in_bytes(disk)} of models in {folders.work}. Memory: at most {in_bytes(memory)} for a stage; "
         f"{in_bytes(machine.memory)} may be used."
     )
-
-
-def model_size(job: Job) -> float:
-    """Return the bytes of a stage's model: its budget, or its Gaussians with all floats."""
-    budget = job.system.budget_bytes
-    return model_bytes(job.system) if budget is None else budget
 
 
 def duration(seconds: float) -> str:

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from a2tg_jax.base.text import shortened
-from lab.jobs import Folders, Job, Record, model_bytes, run_job
+from lab.jobs import Folders, Job, Record, run_job
 
 POLL_SECONDS = 0.5
 LONGEST_REASON = 400
@@ -382,5 +382,4 @@ def _first_open(job: Job, folders: Folders, records: Records, *, is_start: bool 
 
 def estimated_bytes(job: Job) -> float:
     """Return about how much memory a job takes, so that no more run at once than fit."""
-    budget = job.system.budget_bytes
-    return BASE_BYTES + COPIES * (model_bytes(job.system) if budget is None else budget)
+    return BASE_BYTES + COPIES * job.model_bytes

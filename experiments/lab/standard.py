@@ -37,48 +37,34 @@ WRITERS: Mapping[str, Callable[[Grid, Sequence[Result]], str]] = {
 """Functions that write the tables of a grid, by kind."""
 
 
-def table_experiment(name: str, description: str, grid: str | None = None) -> Experiment:
+def table_experiment(name: str, description: str, grid: str | None = None, paper: str = "") -> Experiment:
     """Return an experiment that writes the tables of one grid.
 
     Args:
       name: name of the experiment.
       description: one line for the command line.
       grid: name or path of the grid; by default the experiment's name.
+      paper: the paper's table, which follows; empty for none.
     """
 
     def present(lab: Lab, grids: Sequence[Grid]) -> None:
         (grid,) = grids
-        lab.write(name, f"# {grid.title}\n\n{_as_text(lab, grid)}")
+        text = WRITERS[grid.table](grid, tables.results_of(grid, lab.records))
+        text = f"# {grid.title}\n\n{text}{missing_text(grid, lab.records)}"
+        lab.write(name, f"{text}\n## In the paper\n\n{paper}" if paper else text)
 
     return Experiment(name, (grid or name,), present, description)
 
 
 def paper_experiment(name: str, place: str, description: str, everywhere: str = "mean of the data sets") -> Experiment:
-    """Return an experiment that also writes the paper's table of its name.
-
-    Args:
-      name: name of the experiment, its grid, and the paper's table.
-      place: key in which the paper's blocks differ (`tables.paper_table`).
-      description: one line for the command line.
-      everywhere: heading of the figures if the paper's table names no data sets.
-    """
-
-    def present(lab: Lab, grids: Sequence[Grid]) -> None:
-        (grid,) = grids
-        paper = tables.paper_table(name, place, tables.QUALITY_COLUMNS, everywhere)
-        lab.write(name, f"# {grid.title}\n\n{_as_text(lab, grid)}\n## In the paper\n\n{paper}")
-
-    return Experiment(name, (name,), present, description)
+    """Return an experiment that also writes the paper's table of its name; arguments as of `tables.paper_table`."""
+    paper = tables.paper_table(name, place, tables.QUALITY_COLUMNS, everywhere)
+    return table_experiment(name, description, paper=paper)
 
 
 def file_experiment(path: str) -> Experiment:
     """Return the experiment of a grid file of one's own."""
     return table_experiment(Path(path).name.removesuffix(SUFFIX), f"The grid {path}.", path)
-
-
-def _as_text(lab: Lab, grid: Grid) -> str:
-    text = WRITERS[grid.table](grid, tables.results_of(grid, lab.records))
-    return f"{text}{missing_text(grid, lab.records)}"
 
 
 STANDARD = (

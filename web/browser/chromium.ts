@@ -36,7 +36,9 @@ export interface Served {
 }
 
 /** Serve files by path, such as "/scene.a2tgz". A function is called for each request. */
-export function serve(files: Readonly<Record<string, Uint8Array | string | (() => string)>>): Promise<Served> {
+export function serve(
+  files: Readonly<Record<string, Uint8Array | string | (() => Uint8Array | string)>>,
+): Promise<Served> {
   const server = createServer((request, response) => {
     const found = Object.entries(files).find(([path]) => path === request.url)?.[1];
     const body = typeof found === "function" ? found() : found;

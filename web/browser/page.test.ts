@@ -19,6 +19,8 @@ import type { Served } from "./chromium";
 
 const PAGE = readFileSync(new URL("../../a2tg_jax/web/viewer.html", import.meta.url), "utf8");
 const SCENE = Uint8Array.from(readFileSync(new URL("../test/small.a2tgz", import.meta.url)));
+/** A scene without textures, with three cameras. */
+const PLAIN = Uint8Array.from(readFileSync(new URL("../test/plain.a2tgz", import.meta.url)));
 
 describe.skipIf(CHROMIUM === undefined)("the page", () => {
   let browser: Browser;
@@ -142,6 +144,22 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     await other.page.close();
   });
 
+  test("an address ends a flight", async () => {
+    const other = await serve({ "/": PAGE, "/scene.a2tgz": PLAIN });
+    const page = await browser.newPage(DESK);
+    await page.goto(other.address);
+    await page.evaluate(() => window.a2tg?.loaded);
+    await page.click("#fly");
+    await page.waitForFunction(() => document.getElementById("fly")?.textContent === "Stop");
+    const view = [1, 2, -3, 1, 0, 0, 0, 0, 1, 4, 60, 60, 32, 24, 0, 64, 48];
+    await page.evaluate((hash) => (location.hash = hash), `#view=${view.join(",")}`);
+    await page.waitForFunction(() => document.getElementById("fly")?.textContent === "Fly");
+    await page.waitForTimeout(300);
+    expect((await poseOn(page)).position).toEqual([1, 2, -3]);
+    await page.close();
+    other.close();
+  });
+
   test("slow pictures are coarse in motion and complete at rest", async () => {
     const { page } = await opened("", { viewport: { width: 320, height: 240 } });
     const isWhole = (): Promise<unknown> =>
@@ -252,10 +270,11 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
       bytes: 9e4,
       is_paused: false,
     };
+    let scene = PLAIN;
     const tell = (is_paused: boolean): string => JSON.stringify(Object.assign(status, { is_paused }));
     const other = await serve({
       "/": PAGE.replace("<html ", '<html data-training="yes" '),
-      "/scene.a2tgz": SCENE,
+      "/scene.a2tgz": () => scene,
       "/training.json": () => tell(status.is_paused),
       "/pause": () => tell(true),
       "/resume": () => tell(false),
@@ -265,16 +284,36 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     await page.waitForSelector("#training:not([hidden])");
     expect(await page.textContent("#state")).toContain("20 of 100");
     expect(await page.evaluate(() => window.a2tg?.viewer.splats)).toBeNull();
-    const shown = (): Promise<unknown> => page.waitForFunction(() => window.a2tg?.viewer.splats?.numDrawn === 300);
+    const shown = (num: number): Promise<unknown> =>
+      page.waitForFunction((wanted) => window.a2tg?.viewer.splats?.numDrawn === wanted, num);
     status.version = 1;
-    await shown();
-    const before = await page.evaluateHandle(() => window.a2tg?.viewer.splats);
+    await shown(40);
+    const textures = page.locator('#mode option[value="texture"]');
+    expect(await textures.isDisabled()).toBe(true);
+    // A snapshot that does not arrive whole is no end.
+    scene = SCENE.subarray(0, SCENE.length - 100);
     status.version = 2;
+    await page.waitForSelector("#message:not([hidden])");
+    expect(await page.textContent("#message")).toContain("cut off");
+    await shown(40);
+    scene = SCENE;
+    status.version = 3;
+    await shown(300);
+    await page.waitForSelector("#message", { state: "hidden" });
+    expect(await textures.isDisabled()).toBe(false);
+    const before = await page.evaluateHandle(() => window.a2tg?.viewer.splats);
+    status.version = 4;
     await page.waitForFunction((old) => window.a2tg?.viewer.splats !== old, before);
-    await shown();
+    await shown(300);
     await page.click("#pause");
     await page.waitForFunction(() => document.getElementById("pause")?.textContent === "Resume");
     expect(status.is_paused).toBe(true);
+    await page.evaluate(() =>
+      window.a2tg?.viewer.canvas.getContext("webgl2")?.getExtension("WEBGL_lose_context")?.loseContext(),
+    );
+    status.version = 5;
+    await page.waitForTimeout(2500);
+    expect(await page.textContent("#message")).toContain("connection to the GPU was lost");
     await page.click("#pause");
     await page.waitForFunction(() => document.getElementById("pause")?.textContent === "Pause");
     other.close();

@@ -40,6 +40,8 @@ export class Controls {
   private readonly keys = new Set<string>();
   private time = 0;
   private isFlying = false;
+  /** Whether Shift is held. */
+  private isFast = false;
   private tapped = { time: -Infinity, x: 0, y: 0 };
 
   constructor(canvas: HTMLElement, steered: Steered) {
@@ -53,7 +55,10 @@ export class Controls {
     canvas.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     canvas.addEventListener("keydown", (event) => this.pressKey(event));
-    canvas.addEventListener("keyup", (event) => this.keys.delete(event.code));
+    canvas.addEventListener("keyup", (event) => {
+      this.isFast = event.shiftKey;
+      this.keys.delete(event.code);
+    });
     canvas.addEventListener("blur", () => {
       this.keys.clear();
       canvas.classList.remove("is-pointed");
@@ -106,6 +111,7 @@ export class Controls {
   }
 
   private pressKey(event: KeyboardEvent): void {
+    this.isFast = event.shiftKey;
     if (event.altKey || event.metaKey || event.ctrlKey) return;
     if (event.code in FLIGHT || event.code in TURNS) {
       event.preventDefault();
@@ -114,7 +120,7 @@ export class Controls {
         this.isFlying = true;
         requestAnimationFrame((time) => {
           this.time = time;
-          this.fly(time, event.shiftKey);
+          this.fly(time);
         });
       }
     } else if (event.key === "+" || event.key === "=") {
@@ -124,14 +130,14 @@ export class Controls {
     }
   }
 
-  private fly(time: number, isFast: boolean): void {
+  private fly(time: number): void {
     const seconds = Math.min((time - this.time) / 1000, 0.1);
     this.time = time;
     if (this.keys.size === 0) {
       this.isFlying = false;
       return;
     }
-    const speed = this.steered.extent * (isFast ? 1.5 : 0.5) * seconds;
+    const speed = this.steered.extent * (this.isFast ? 1.5 : 0.5) * seconds;
     let { pose } = this.steered;
     for (const key of this.keys) {
       const [flight, turn] = [FLIGHT[key], TURNS[key]];
@@ -139,7 +145,7 @@ export class Controls {
       if (turn !== undefined) pose = panned(pose, this.steered.up, turn[0] * seconds, turn[1] * seconds);
     }
     this.change(pose);
-    requestAnimationFrame((next) => this.fly(next, isFast));
+    requestAnimationFrame((next) => this.fly(next));
   }
 
   private zoom(factor: number): void {

@@ -11,12 +11,14 @@ import type { Viewer } from "./viewer";
 
 /** Largest number of cameras that the flight follows; photographs taken by hand make it shake. */
 const MOST_STOPS = 16;
+/** Largest number of cameras that are put into a tour: its time grows with their square. */
+const MOST_CAMERAS = 500;
 /** Milliseconds from one of them to the next. */
 const STEP = 2500;
 
 /** Return the poses of some cameras in a short tour, which begins at an end and goes on to the nearest one. */
 export function tourOf(cameras: readonly SceneCamera[]): readonly Pose[] {
-  const left = cameras.map(({ viewmat }) => {
+  const left = thinned(cameras, MOST_CAMERAS).map(({ viewmat }) => {
     const pose = poseOf(viewmat, 1);
     return { ...pose, focus: Math.max(-dot(pose.position, pose.rotation[2]), 0.2) };
   });
@@ -33,8 +35,13 @@ export function tourOf(cameras: readonly SceneCamera[]): readonly Pose[] {
     const next = left.reduce((best, _, i) => (cost(at(left, i)) < cost(at(left, best)) ? i : best), 0);
     tour.push(...left.splice(next, 1));
   }
-  const every = Math.ceil(tour.length / MOST_STOPS);
-  return tour.filter((_, i) => i % every === 0);
+  return thinned(tour, MOST_STOPS);
+}
+
+/** Return every k-th value, so that there are at most so many. */
+function thinned<T>(values: readonly T[], most: number): T[] {
+  const every = Math.ceil(values.length / most);
+  return values.filter((_, i) => i % every === 0);
 }
 
 /** Return the view at a time in stops, which a uniform cubic B-spline passes closely; it goes back after the last. */

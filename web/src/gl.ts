@@ -2,6 +2,9 @@
 
 import { SceneError } from "./format";
 
+export const CONTEXT_LOST =
+  "The connection to the GPU was lost, possibly because its memory is full. Reload the page to try again.";
+
 /** A linked program with a cache of uniform locations. */
 export class Program {
   readonly handle: WebGLProgram;
@@ -50,6 +53,8 @@ export class LongTexture {
   /** Allocate `num` texels in rows of 2^widthBits. Throws a SceneError if the GPU's limit is lower. */
   constructor(gl: WebGL2RenderingContext, num: number, widthBits: number, what: string) {
     this.gl = gl;
+    // All limits of a lost context are null.
+    if (gl.isContextLost()) throw new SceneError(CONTEXT_LOST);
     this.width = 1 << widthBits;
     const height = Math.max(Math.ceil(num / this.width), 1);
     const most = gl.getParameter(gl.MAX_TEXTURE_SIZE) as number;

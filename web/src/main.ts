@@ -5,9 +5,10 @@ import "./style.css";
 import { lensOf, poseOf } from "./camera";
 import type { Intrinsics, Viewmat } from "./camera";
 import { SceneError } from "./format";
+import { CONTEXT_LOST } from "./gl";
 import { hasPanel } from "./link";
 import type { Vec2 } from "./math";
-import { bytesText, countText, element, setFigures, showMessage } from "./page";
+import { bytesText, countText, element, setFigures, setText, showMessage } from "./page";
 import { Panel } from "./panel";
 import { MODES } from "./shaders";
 import { openScene, readScene } from "./source";
@@ -40,10 +41,11 @@ async function load(viewer: Viewer, panel: Panel, source: Source): Promise<void>
   let splats: Splats | null = null;
   let numShown = 0;
   const isFirst = viewer.splats === null;
-  await readScene(source, {
+  const reading = readScene(source, {
     onHeader: (header) => {
       splats = viewer.begin(header);
       if (isFirst) panel.begin(header);
+      else panel.offerModes(header);
     },
     onChunk: async (chunk, numRead) => {
       if (splats === null) return;
@@ -61,8 +63,14 @@ async function load(viewer: Viewer, panel: Panel, source: Source): Promise<void>
       numShown = splats.num;
     },
   });
+  const last = await reading.then(
+    () => splats,
+    (error: unknown) => {
+      if (splats !== viewer.splats) splats?.delete();
+      throw error;
+    },
+  );
   progress.hidden = true;
-  const last = splats as Splats | null;
   if (last === null || last.num === 0) throw new SceneError("The scene is empty.");
   await last.settled();
 }
@@ -113,7 +121,9 @@ function begin(): void {
   const show = async (): Promise<void> => {
     await load(viewer, panel, await openScene());
   };
-  const loaded = (isTraining() ? followTraining(show) : Promise.resolve(false)).then((isLive) =>
+  // A snapshot that fails is followed by others, and the last one by the end of the server.
+  const showNext = (): Promise<void> => show().then(() => setText("message", ""), fail);
+  const loaded = (isTraining() ? followTraining(showNext) : Promise.resolve(false)).then((isLive) =>
     isLive ? undefined : show(),
   );
   loaded.catch(fail);
@@ -124,11 +134,7 @@ function begin(): void {
     render: (viewmat, K, size, mode) =>
       viewer.read(poseOf(viewmat, 1), lensOf(K, size), MODES.find((name) => name === mode) ?? "full"),
   };
-  viewer.canvas.addEventListener("webglcontextlost", () =>
-    showMessage(
-      "The connection to the GPU was lost, possibly because its memory is full. Reload the page to try again.",
-    ),
-  );
+  viewer.canvas.addEventListener("webglcontextlost", () => showMessage(CONTEXT_LOST));
 }
 
 function fail(error: unknown): void {

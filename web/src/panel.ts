@@ -75,6 +75,8 @@ export class Panel {
     this.onClick("fullscreen", () => {
       void toggleFullScreen();
     });
+    // Phones and frames may have none.
+    element("fullscreen", HTMLButtonElement).hidden = !document.fullscreenEnabled;
     this.onClick("keep", () => this.keep());
     this.onClick("save", () => this.save());
     this.onClick("save-edit", () => this.saveEdit());
@@ -115,6 +117,11 @@ export class Panel {
       (camera, index) => new Option(camera.isTest ? `${camera.name} (test)` : camera.name, String(index)),
     );
     this.camera.replaceChildren(new Option("free", "-1"), ...choices);
+    this.offerModes(header);
+  }
+
+  /** Offer the modes that a scene has: a training may add textures. */
+  offerModes(header: Header): void {
     const hasTextures = header.numTexels > 0;
     element("compare", HTMLElement).hidden = !hasTextures;
     for (const option of this.mode.options) {
@@ -255,6 +262,7 @@ export class Panel {
     const view = viewOf(location.hash);
     if (view === null) return false;
     const { viewer } = this;
+    this.flight.stop();
     if (viewer.splats !== null) viewer.settle(viewer.splats);
     [viewer.pose, viewer.image, viewer.fit] = [view.pose, view.lens, view.fit];
     if (view.up !== null) viewer.chooseUp(view.up);

@@ -22,7 +22,9 @@ export class ByteReader {
     const pieces: Uint8Array[] = [];
     for (let missing = num; missing > 0;) {
       if (this.rest.length === 0) {
-        const { value, done } = await this.reader.read();
+        const { value, done } = await this.reader.read().catch(() => {
+          throw new SceneError("The connection was lost before the whole scene had arrived. Reload the page.");
+        });
         if (done) throw new SceneError("The scene is cut off.");
         this.rest = value;
       }

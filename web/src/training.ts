@@ -18,6 +18,7 @@ export interface Status {
   readonly iteration: number;
   /** NaN before iteration 10, like the fields below. */
   readonly loss: number;
+  /** NaN also if it is infinite. */
   readonly psnr: number;
   readonly num: number;
   readonly bytes: number;
@@ -54,9 +55,10 @@ export function statusText(status: Status): string {
     return status.stage === "" ? "Training is starting." : `Stage ${status.stage} is starting.`;
   }
   const state = status.isPaused ? ", paused" : status.isFinishing ? ", finishing" : "";
+  const psnr = Number.isNaN(status.psnr) ? "" : `${status.psnr.toFixed(2)} dB, `;
   return (
     `${status.stage}: ${countText(status.iteration)} of ${countText(status.iterations)}${state}. ` +
-    `Loss ${status.loss.toFixed(4)}, ${status.psnr.toFixed(2)} dB, ${countText(status.num)} Gaussians, ${bytesText(status.bytes)}.`
+    `Loss ${status.loss.toFixed(4)}, ${psnr}${countText(status.num)} Gaussians, ${bytesText(status.bytes)}.`
   );
 }
 

@@ -102,6 +102,7 @@ export class Viewer implements Steered {
     this.watch = new Stopwatch(gl);
     new Controls(canvas, this);
     new ResizeObserver(() => this.draw()).observe(canvas);
+    this.watchRatio();
   }
 
   /** Start a scene, which replaces the current one once it is completely sorted. */
@@ -221,6 +222,18 @@ export class Viewer implements Steered {
 
   private get depthRow(): Row4 {
     return projection(this.pose, this.lens)[2];
+  }
+
+  /** Draw again when the window goes to a screen of other pixels, which leaves its size as it is. */
+  private watchRatio(): void {
+    matchMedia(`(resolution: ${window.devicePixelRatio}dppx)`).addEventListener(
+      "change",
+      () => {
+        this.draw();
+        this.watchRatio();
+      },
+      { once: true },
+    );
   }
 
   private request(): void {

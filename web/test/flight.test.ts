@@ -26,6 +26,11 @@ test("a tour goes from one end to the other, with few stops", () => {
   expect(tourOf(camerasAt(Array.from({ length: 100 }, (_, i) => i))).length).toBe(15);
 });
 
+test("a tour of thousands of cameras takes no seconds", () => {
+  const angles = Array.from({ length: 20_000 }, (_, i) => (180 * ((i * 7919) % 20_000)) / 20_000);
+  expect(tourOf(camerasAt(angles)).length).toBeLessThanOrEqual(16);
+});
+
 test("a flight is level, has no jumps, and comes back", () => {
   const stops = tourOf(camerasAt([0, 30, 60, 90]));
   const poses = Array.from({ length: 121 }, (_, i) => poseAt(stops, i / 20, UP));

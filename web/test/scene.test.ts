@@ -143,6 +143,18 @@ test("shapes of kernels take a byte of the packed rows", async () => {
   }
 });
 
+test("a connection that breaks off is named, and what to do", async () => {
+  const bytes = new ReadableStream<Uint8Array<ArrayBuffer>>({
+    pull(controller) {
+      controller.enqueue(SMALL.slice(0, 100));
+      controller.error(new TypeError("network error"));
+    },
+  });
+  await expect(
+    readScene({ bytes, length: null }, { onHeader: () => undefined, onChunk: () => Promise.resolve() }),
+  ).rejects.toThrow(/connection was lost .* Reload the page/);
+});
+
 test("truncated files are rejected", async () => {
   for (const length of [0, 5, HEAD_BYTES, HEAD_BYTES + 30, SMALL.length >> 1, SMALL.length - 1]) {
     await expect(read(SMALL.slice(0, length))).rejects.toThrow(SceneError);

@@ -20,6 +20,12 @@ test("status of a running training", () => {
   );
 });
 
+test("status of a training whose pictures equal their photographs", () => {
+  const figures = { iteration: 120, iterations: 2000, loss: 0, psnr: null, num: 1500, bytes: 541792 };
+  const status = statusOf({ version: 3, stage: "gaussians", ...figures });
+  expect(status && statusText(status)).toBe("gaussians: 120 of 2,000. Loss 0.0000, 1,500 Gaussians, 542 kB.");
+});
+
 test("status of a training that is finishing", () => {
   const figures = { iteration: 120, iterations: 2000, loss: 0.1, psnr: 21.5, num: 1500, bytes: 541792 };
   const status = statusOf({ version: 3, stage: "textures", is_finishing: true, ...figures });

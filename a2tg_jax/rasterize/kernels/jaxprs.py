@@ -229,7 +229,9 @@ class PixelFunctions:
         statistic = self.settings.statistic
         functions = self._functions
         at_pixel = planes, splat, lookup, x, y, transmittance, is_live, suffix_sum, g
-        state, weight, d = pixel.blend_vjp(functions, near_plane, *at_pixel, statistic is not None)
+        state, weight, d = pixel.blend_vjp(
+            functions, near_plane, *at_pixel, statistic is not None, self.settings.only_colors
+        )
         added: tuple[Array, ...] = ()
         if statistic and d.rho is not None:
             hit = pixel.intersect(planes, x, y, near_plane, functions.has_low_pass)

@@ -289,6 +289,9 @@ class _TracedPass:
         lookup = self.look_up(regions, hit)
 
         def of_floats(splats: Splats, values: tuple[Array, ...], rho_probe: Array | None) -> pixel.Shown:
+            if self.settings.only_colors:
+                fixed, values = jax.lax.stop_gradient((splats, values))
+                splats = fixed._replace(colors=splats.colors)
             splat, planes = self.spread(splats, tile)
             hit = self.hit(planes, tile)
             values = pixel.values_at(self.functions, lookup, hit, values)

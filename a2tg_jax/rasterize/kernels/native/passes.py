@@ -514,13 +514,16 @@ class _Backward(_Pass):
         self.scatter(suffix_sum, self.suffix_sum, vector.blocks)
         d_values = rest[: self.num_values]
         sums = rest[self.num_values :]
-        if self.settings.statistic:
+        settings = self.settings
+        if settings.statistic:
             sums.append(lanes.constant(1.0, self.real))
         # Selected, not multiplied: the cotangents of a pixel that shows nothing may not be finite.
         chosen = functools.partial(b.select, contributes, rhs=lanes.constant(0.0, self.real))
         with b.if_then(lanes.any(contributes)):
             b.store(BOOL(1), self.any_contributes)
             for total, value in zip(totals, sums, strict=True):
+                if settings.only_colors and isinstance(value, ir.Constant):
+                    continue  # Zero.
                 so_far = b.load(total, typ=self.block_reals)
                 for part, is_chosen in zip(self.parts(value), self.parts(contributes), strict=True):
                     so_far = b.select(is_chosen, b.fadd(so_far, part), so_far)
@@ -557,6 +560,12 @@ class _Backward(_Pass):
         """Sum over lanes, carry the planes' cotangents to the homography, and add all to the splat's rows."""
         functions = self.functions
         sums = self.block.sums([self.b.load(total, typ=self.block_reals) for total in totals])
+        if self.settings.only_colors:
+            # Behind the opacity, as in the row.
+            first = functions.num_planes + 1
+            for k in range(self.settings.num_colors):
+                self.store(self.b.fadd(self.load(rows[0], 10 + k, self.real), sums[first + k]), rows[0], 10 + k)
+            return
         d_planes = sums[: functions.num_planes]
         others = sums[functions.num_planes :]
         # All pixels of a tile share the planes: their cotangents are summed first, and pulled back to M once.
