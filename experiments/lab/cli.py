@@ -322,7 +322,7 @@ def argument_parser(description: str) -> argparse.ArgumentParser:
     add = parser.add_argument
     add("--scenes", type=Path, default=Path("scenes"), help="folder of the scenes that grids/scales.toml names")
     add("--scale", type=_scale, default="small", metavar=f"{{{','.join(SCALES)}}}",
-        help="full is the paper's, for a GPU; long has its options and length on small photographs; claims, protocol, "
+        help="full is the paper's, for a GPU; long has its options and length on small photographs; claims, "
         "protocol160, paper160, full_size (for a GPU) and half_size are in PROTOCOL.md")  # fmt: skip
     add("--only", action="append", metavar="SCENE", help="run this scene of the scale only; may be repeated")
     add("--scene", action="append", type=Path, default=[], metavar="PATH",
