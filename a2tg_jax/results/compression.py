@@ -86,7 +86,7 @@ def compress(
     options.check()
     max_bytes = budget_in_bytes(options.file_budget, "file_budget")
     num_iterations = options.tune_iterations
-    if out is not None and (out.is_dir() or out.suffix.lower() != SUFFIX):
+    if out is not None and out.suffix.lower() != SUFFIX:
         raise ValueError(f"out must be the path of a file that ends in {SUFFIX}; got {out}")
     opened = open_source(source)
     model = opened.model

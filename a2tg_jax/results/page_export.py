@@ -125,7 +125,7 @@ def export_comparison(sources: Sequence[Source], out: Path, *, overwrite: bool =
       FileExistsError: if the file exists.
       ValueError: if it does not end in .html, or the models are not in one world.
     """
-    if out.suffix.lower() != ".html" or out.is_dir():
+    if out.suffix.lower() != ".html":
         raise ValueError(f"`out` must be the path of a file that ends in .html; got {out}")
     check_new(out, "`out`", overwrite=overwrite)
     first, second = sources
