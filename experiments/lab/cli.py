@@ -83,9 +83,7 @@ class Lab:
         for path in self.args.scene:
             scene = own_scene(path, downscale)
             if scenes.setdefault(scene.label, scene) != scene:
-                raise ValueError(
-                    f"two folders of --scene are called {scene.label}, one in tables: rename one of them"
-                )
+                raise ValueError(f"two folders of --scene are called {scene.label}, one in tables: rename one of them")
         return tuple(scenes.values())
 
     @property
