@@ -13,7 +13,6 @@ Next to the folder `images` may be
 import contextlib
 import dataclasses
 import functools
-import os
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -473,7 +472,7 @@ def _depth_map(file: Path, lens: Lens, stored: tuple[int, int], size: tuple[int,
     return DepthMap((size[1], size[0]), load)
 
 
-def read_depths(file: str | os.PathLike[str]) -> np.ndarray:
+def read_depths(file: Path) -> np.ndarray:
     """Return the numbers [H, W] float32 of a depth map, an .npy or a greyscale PNG, whose largest value is 1."""
     if Path(file).suffix.lower() == ".npy":
         try:
