@@ -6,7 +6,6 @@ the extension A2TG_splat_textures; programs without it show plain splats. docs/f
 """
 
 import os
-import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
@@ -20,6 +19,7 @@ from a2tg_jax.base.json_text import number_array
 from a2tg_jax.base.regular_files import reading
 from a2tg_jax.base.suffixes import checked_path
 from a2tg_jax.base.text import shortened
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.core.sh import NUM_BASES, SH_C0
 from a2tg_jax.io.columns import Ends, checked_shapes, dequantised, ends_of, log_exponents_of, quantised
 from a2tg_jax.io.gltf_container import Builder, Document, mesh_nodes, scene_of_one
@@ -232,7 +232,7 @@ def _model_of(document: Document, primitive: Mapping[str, Any]) -> Model:
         value = described.get(name)
         if value != DESCRIBED[name]:
             message = f"its splats have the {name} {shortened(value)}; they are read as {DESCRIBED[name]}"
-            warnings.warn(f"{document.path}: {message}", stacklevel=5)
+            warn(f"{document.path}: {message}")
     extras = primitive.get("extras", {})
     kept = extras.get(OWN, {}) if isinstance(extras, dict) else {}
     origin = origin_of(kept["origin"], kept["origin"]) if "origin" in kept else None

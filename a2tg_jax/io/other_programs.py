@@ -9,7 +9,6 @@ import collections
 import dataclasses
 import math
 import string
-import warnings
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -25,6 +24,7 @@ from a2tg_jax.base.atomic import write_whole
 from a2tg_jax.base.checks import LARGEST_NUMBER, check_literal
 from a2tg_jax.base.regular_files import existing_bytes, reading
 from a2tg_jax.base.text import counted, first_names, shortened
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.core.gaussians import LARGEST_LOG_SCALE, LARGEST_OPACITY
 from a2tg_jax.core.origin import check_origin
 from a2tg_jax.core.sh import NUM_BASES, SH_C0
@@ -348,7 +348,7 @@ def flat_rows(name: str, rows: FileRows, *, keeps_all: bool = False) -> FileRows
             f"{name}: {counted(len(unrotated), 'Gaussian')} of {len(lengths):,} with the rotation 0 0 0 0, read as "
             f"unrotated; the first is row {unrotated[0]:,} (from 0)"
         )
-        warnings.warn(message, stacklevel=4)
+        warn(message)
         quats[unrotated] = [1, 0, 0, 0]
     # The squares of these leave the range of float32.
     is_extreme = ((lengths > 0) & (lengths < LEAST_LENGTH)) | (np.isfinite(lengths) & (lengths > 1 / LEAST_LENGTH))
@@ -396,7 +396,7 @@ def drawable_rows(name: str, rows: FileRows) -> np.ndarray:
             f"NaN, infinite or too large to draw (beyond ±{LARGEST_NUMBER:g}); the first is row {first:,} (from 0), "
             f"with {what}"
         )
-        warnings.warn(message, stacklevel=5)
+        warn(message)
     return is_drawable
 
 
@@ -437,7 +437,7 @@ def flattened(quats: np.ndarray, log_scales: np.ndarray, name: str) -> tuple[np.
     num_thick = np.count_nonzero(dropped > kept.min(axis=1) + np.log(2 * THICKNESS))
     if num_thick:
         message = f"{name}: holds 3D Gaussians (scale_2), {num_thick} of them not flat; their thinnest axis is dropped"
-        warnings.warn(message, stacklevel=4)
+        warn(message)
     # The product of quaternions: the turn of the axes first, then the splat's own rotation.
     w, x, y, z = quats.T
     a, b, c, d = AXES_TO_NORMAL[thinnest].T
@@ -463,14 +463,14 @@ def warn_of_unread(names: Iterable[str], path: Path) -> None:
             f"{path}: does not read {first_names(kinds)}; if the program that "
             "wrote the file draws by these attributes, its Gaussians look different here"
         )
-        warnings.warn(message, stacklevel=5)
+        warn(message)
 
 
 def degree_to_read(degree: int, name: str) -> int:
     """Return the SH degree to read from a file, at most 3. Warn if the file's is higher."""
     if degree > MAX_DEGREE:
         message = f"{name}: has SH of degree {degree}; degree {MAX_DEGREE} is read, and what is above it left out"
-        warnings.warn(message, stacklevel=4)
+        warn(message)
     return min(degree, MAX_DEGREE)
 
 
@@ -653,7 +653,7 @@ def warn_of_offset(kind: Kind, offset: np.ndarray, path: Path | str) -> None:
             f"{path}: positions are relative to ({', '.join(number_words(offset))}), because the format "
             f"would round such large coordinates too far; {place}"
         )
-        warnings.warn(message, stacklevel=3)
+        warn(message)
 
 
 def number_words(numbers: np.ndarray) -> list[str]:
@@ -678,7 +678,7 @@ def check_positions(kind: Kind, gaussians: Gaussians, path: Path) -> None:
     if rounding > MOST_ROUNDING:
         advice = "write *.ply or *.sog, or enlarge the scene" if kind == "spz" else "write *.ply"
         message = f"{path}: positions are rounded by {rounding:.2g} times the scale of a typical Gaussian; {advice}"
-        warnings.warn(message, stacklevel=4)
+        warn(message)
 
 
 def _rounding(kind: Kind, means: np.ndarray) -> np.ndarray:

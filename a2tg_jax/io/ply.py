@@ -15,7 +15,6 @@ rotation as the index of its largest number and the three others in 10 bits; col
 """
 
 import os
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import BinaryIO
@@ -29,6 +28,7 @@ from a2tg_jax.appearance.parts import LEAST_OPACITY
 from a2tg_jax.base.atomic import write_whole
 from a2tg_jax.base.regular_files import check_exists, open_regular, reading
 from a2tg_jax.base.suffixes import checked_path
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.core.sh import NUM_BASES, SH_C0
 from a2tg_jax.data.other_runs import model_hint
 from a2tg_jax.data.ply import OFFSET, RGB, ROTATION, SH_DEGREE0, PlyFile, largest_color
@@ -214,7 +214,7 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
     model = load_ply_model(path)
     if model.origin is not None and model.origin.transform.translation.any():
         offset = ", ".join(number_words(-model.origin.transform.translation))
-        warnings.warn(f"{path}: positions are relative to ({offset}); load_splats keeps this offset", stacklevel=2)
+        warn(f"{path}: positions are relative to ({offset}); load_splats keeps this offset")
     return model.gaussians
 
 
