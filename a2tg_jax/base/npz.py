@@ -53,7 +53,7 @@ def read_npy(path: Path) -> np.ndarray:
 
     Raises:
       OSError: if the file cannot be opened.
-      ValueError: with the reason, if it is damaged or not numeric.
+      Exception: of any class, such as SyntaxError, if it is damaged or not numeric.
     """
     with open_regular(path) as file:
         return _read_array(file, "it", os.fstat(file.fileno()).st_size)

@@ -116,7 +116,7 @@ def find_photos(folder: Path, least: int = LEAST_PHOTOS, chosen: Sequence[Path] 
 
     Raises:
       FileNotFoundError: if there is no such folder.
-      ValueError: if it is a file, or holds fewer than `least` photographs.
+      ValueError: if it holds fewer than `least` photographs, or a chosen file is another program's.
     """
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder of photographs, photograph or video")
