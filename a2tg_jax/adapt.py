@@ -11,7 +11,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jax.typing import ArrayLike
 
-from a2tg_jax.base.checks import check_int, check_literal, check_number, check_shape
+from a2tg_jax.base.checks import check_fields, check_int, check_literal, check_number, check_shape
 from a2tg_jax.base.text import bytes_of
 from a2tg_jax.core.budget import MOST_ROOM, event_budget, within_budget
 from a2tg_jax.core.optim import AdamState
@@ -94,14 +94,11 @@ class Upscale(HostEvent):
         return self.gradient
 
     def check_options(self) -> None:
-        check_number("cap", self.cap, least=1, most=MAX_SIDE)
-        check_number("fraction", self.fraction, least=0, most=1)
-        check_number("k_a", self.k_a, least=1)
-        check_number("k_s", self.k_s, least=0)
-        if self.threshold is not None:
-            check_number("threshold", self.threshold, least=0)
-        if self.budget_mb is not None:
-            check_number("budget_mb", self.budget_mb, least=1e-6)
+        check_fields(self, "cap", least=1, most=MAX_SIDE)
+        check_fields(self, "fraction", least=0, most=1)
+        check_fields(self, "k_a", least=1)
+        check_fields(self, "k_s", "threshold", least=0)
+        check_fields(self, "budget_mb", least=1e-6)
         if self.select == "budget" and self.budget_mb is None:
             raise ValueError("select is 'budget', so it needs budget_mb, in MB (10^6 bytes)")
         if self.select == "threshold" and self.threshold is None:

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.base.checks import check_count, check_number, check_shape
+from a2tg_jax.base.checks import check_count, check_fields, check_shape
 from a2tg_jax.core.budget import number_to_reach
 from a2tg_jax.core.gaussians import DEAD_OPACITY, MAX_SHARES, Gaussians, check_gaussians, share
 from a2tg_jax.core.optim import AdamState
@@ -327,7 +327,7 @@ class Mcmc(StepEvent):
 
     def check_options(self) -> None:
         if self.cap:
-            check_number("cap", self.cap, least=2)
+            check_fields(self, "cap", least=2)
 
     def times(self, num_iterations: int) -> Times:
         return densify_times(num_iterations) if self.cap else ()
@@ -378,7 +378,7 @@ class FillingMcmc(Mcmc):
     """Variant of `Mcmc` that grows by more than 5 % where that is needed to reach the cap by its last event."""
 
     def check_options(self) -> None:
-        check_number("cap", self.cap, least=2)
+        check_fields(self, "cap", least=2)
 
     def num_rows(self, num: int, num_iterations: int) -> int:
         if num < self.cap and not self.times(num_iterations):

@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike, DTypeLike
 
-from a2tg_jax.base.checks import check_number, check_shape
+from a2tg_jax.base.checks import check_fields, check_shape
 from a2tg_jax.base.config_json import check_config
 from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.core.bilinear import TextureRegion
@@ -91,12 +91,12 @@ class TextureOptions(NamedFields):
     def __post_init__(self) -> None:
         """Check the conventions and the extent."""
         check_config(self)
-        check_number("extent", self.extent, least=LEAST_EXTENT, most=MOST_EXTENT)
+        check_fields(self, "extent", least=LEAST_EXTENT, most=MOST_EXTENT)
 
     def check_options(self) -> None:
         """Raise ValueError, beginning with the name of the field, if a number is out of range."""
-        check_number("initial_rgb", self.initial_rgb, least=-1, most=1)
-        check_number("max_alpha", self.max_alpha, least=1e-3, most=0.9999)
+        check_fields(self, "initial_rgb", least=-1, most=1)
+        check_fields(self, "max_alpha", least=1e-3, most=0.9999)
 
     @staticmethod
     def official() -> "TextureOptions":

@@ -113,6 +113,15 @@ def check_number(
         raise ValueError(f"{name} must be {wanted or 'a number'}; got {value!r}")
 
 
+def check_fields(instance: object, *names: str, **limits: float) -> None:
+    """Check numbers of a dataclass by the names of their fields, as `check_number` does; None passes, which other
+    checks refuse where it may not be (`check_config`)."""
+    for name in names:
+        value = getattr(instance, name)
+        if value is not None:
+            check_number(name, value, **limits)
+
+
 def check_numeric(name: str, value: object) -> None:
     """Raise ValueError unless a value is a number or an array of numbers of any shape; none is read."""
     if not _is_numeric(value):

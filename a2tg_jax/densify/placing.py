@@ -15,7 +15,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from a2tg_jax.appearance import allocate_appearance
-from a2tg_jax.base.checks import check_number
+from a2tg_jax.base.checks import check_fields
 from a2tg_jax.base.even_spacing import evenly_chosen
 from a2tg_jax.core.cameras import back_project
 from a2tg_jax.core.gaussians import Gaussians, no_rows, sh_of_colors
@@ -58,8 +58,8 @@ class PlaceByError(HostEvent):
     """Largest number of Gaussians, at most the rows that densification has allocated."""
 
     def check_options(self) -> None:
-        check_number("share", self.share, least=0, most=1)
-        check_number("cap", self.cap, least=2)
+        check_fields(self, "share", least=0, most=1)
+        check_fields(self, "cap", least=2)
         self.times(1)  # checks `at`
 
     def times(self, num_iterations: int) -> Times:

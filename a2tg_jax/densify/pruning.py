@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.base.checks import check_number
+from a2tg_jax.base.checks import check_fields
 from a2tg_jax.base.text import counted
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.optim import AdamState
@@ -62,9 +62,8 @@ class Prune(_Pruning):
     """Fractions of the stage at which Gaussians are pruned; 1: at its end."""
 
     def check_options(self) -> None:
-        check_number("share", self.share, least=0, below=1)
-        if self.keep is not None:
-            check_number("keep", self.keep, least=LEAST_LEFT)
+        check_fields(self, "share", least=0, below=1)
+        check_fields(self, "keep", least=LEAST_LEFT)
         self.times(1)  # checks `at`
 
     def num_after(self, num: int, num_iterations: int) -> int:
@@ -180,9 +179,8 @@ class PruneFloaters(_Pruning):
 
     def check_options(self) -> None:
         if self.min_views:
-            check_number("min_views", self.min_views, least=2)
-        check_number("near", self.near, least=0)
-        check_number("least", self.least, least=0)
+            check_fields(self, "min_views", least=2)
+        check_fields(self, "near", "least", least=0)
         if not self.at:
             raise ValueError("at must hold at least one fraction of the stage; got none")
         self.times(1)  # checks `at`

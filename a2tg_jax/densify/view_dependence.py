@@ -14,7 +14,7 @@ from jax import Array
 from jax.typing import DTypeLike
 
 from a2tg_jax.appearance.parts import MAX_DEGREE, Coefficients, degrees_of_sizes, floats_of_band, sizes_of_degrees
-from a2tg_jax.base.checks import check_number
+from a2tg_jax.base.checks import check_fields
 from a2tg_jax.base.text import bytes_of
 from a2tg_jax.core.budget import BYTES_PER_FLOAT, MOST_ROOM, event_budget, within_budget
 from a2tg_jax.core.optim import AdamState
@@ -75,9 +75,8 @@ class AdaptDegrees(HostEvent):
     observes = True  # `Seen.colors`, which needs no statistic
 
     def check_options(self) -> None:
-        check_number("budget_mb", self.budget_mb, least=0)
-        check_number("highest", self.highest, least=0, most=MAX_DEGREE)
-        check_number("idle", self.idle, least=0)
+        check_fields(self, "budget_mb", "idle", least=0)
+        check_fields(self, "highest", least=0, most=MAX_DEGREE)
         self.times(1)  # checks `at`
 
     def times(self, num_iterations: int) -> Times:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from a2tg_jax.appearance import Appearance, Exponents
 from a2tg_jax.appearance.parts import shapes_of
-from a2tg_jax.base.checks import check_number
+from a2tg_jax.base.checks import check_fields
 from a2tg_jax.base.text import shortened
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree
@@ -55,7 +55,7 @@ class TwoStages(System):
 
     def check_options(self) -> None:
         super().check_options()
-        check_number("coarse_share", self.coarse_share, least=0, most=1)
+        check_fields(self, "coarse_share", least=0, most=1)
 
     @classmethod
     def short_presets(cls, quick: dict[str, Any], smoke: dict[str, Any]) -> dict[str, Self]:
@@ -116,7 +116,7 @@ class LimitExponents(StepEvent):
     num_keys = 0
 
     def check_options(self) -> None:
-        check_number("least", self.least, least=0, most=1)
+        check_fields(self, "least", least=0, most=1)
 
     def apply(self, now: Now, model: Model, moments: AdamState, state: tuple[()]) -> Change:
         shapes = model.appearance.shapes

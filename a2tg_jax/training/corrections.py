@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.base.checks import check_number
+from a2tg_jax.base.checks import check_fields
 from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.core.cameras import Camera, moved_viewmat
 from a2tg_jax.core.optim import AdamState, adam_init, adam_update
@@ -71,8 +71,8 @@ class FadingCorrection(Correction):
     """Whether the rows are kept neutral on average over the views."""
 
     def check_options(self) -> None:
-        check_number("rate", self.rate, least=0)
-        check_number("final_factor", self.final_factor, above=0)  # The decay is exponential.
+        check_fields(self, "rate", least=0)
+        check_fields(self, "final_factor", above=0)  # The decay is exponential.
 
     def learning_rate(self, progress: Array) -> Array:
         return self.rate * self.final_factor**progress
@@ -297,7 +297,7 @@ class BilateralGrid(FadingCorrection):
         super().check_options()
         if not all(1 <= number <= LARGEST_GRID for number in self.size):
             raise ValueError(f"size must be numbers in 1..{LARGEST_GRID}; got {self.size}")
-        check_number("smoothness", self.smoothness, least=0)
+        check_fields(self, "smoothness", least=0)
 
     @property
     def neutral(self) -> np.ndarray:

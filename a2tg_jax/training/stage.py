@@ -17,7 +17,7 @@ from jax import Array
 
 from a2tg_jax.appearance import Appearance, allocate_appearance, count_floats
 from a2tg_jax.appearance.base import check_appearance
-from a2tg_jax.base.checks import check_kind, check_number, fields_of, kind_of
+from a2tg_jax.base.checks import check_fields, check_kind, fields_of, kind_of
 from a2tg_jax.base.config_json import check_config
 from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.text import shortened
@@ -57,9 +57,8 @@ class LearningRates(NamedFields):
 
     def check_options(self) -> None:
         """Raise ValueError, beginning with the name of the field, if a rate is out of range."""
-        for field in dataclasses.fields(self):
-            check_number(field.name, getattr(self, field.name), least=0)
-        check_number("means_final_factor", self.means_final_factor, above=0)  # The decay is exponential.
+        check_fields(self, *(field.name for field in dataclasses.fields(self)), least=0)
+        check_fields(self, "means_final_factor", above=0)  # The decay is exponential.
 
     def of_gaussians(self, means: Array, sh_degree: int = 3) -> Gaussians:
         """Return one rate per field of the Gaussians, which broadcasts against it.
@@ -204,11 +203,10 @@ class Stage(NamedFields):
         kinds = sorted({event.statistic for event in self.events if event.statistic is not None})
         if len(kinds) > 1:
             raise ValueError(f"the events of one stage must use one statistic; the events of {self.name!r} use {kinds}")
-        with fields_of(f"{where} rates"):
-            self.rates.check_options()
-        parts: tuple[Event | Correction, ...] = (*self.events, *self.corrections)
-        for part in parts:
-            with fields_of(f"{where} {type(part).__name__}"):
+        parts: list[tuple[str, Any]] = [("rates", self.rates)]
+        parts += [(type(part).__name__, part) for part in (*self.events, *self.corrections)]
+        for name, part in parts:
+            with fields_of(f"{where} {name}"):
                 check_config(part)
                 part.check_options()
         for event in self.events:
