@@ -158,15 +158,15 @@ class Upscale(HostEvent):
         textures = model.textures
         num = model.num
         old_sizes = textures.sizes
-        scales = np.asarray(model.gaussians.scales)
-        averages = np.asarray(state.average())
         # Only rows that exist can grow.
         sizes = old_sizes[:num]
+        scales = np.asarray(model.gaussians.scales)[:num]
+        averages = np.asarray(state.average())[:num]
         new_sizes = old_sizes.copy()
 
         def propose(sizes: np.ndarray, anisotropic: bool) -> np.ndarray:
             return next_sizes(
-                sizes, scales[:num], k_a=self.k_a, k_s=self.k_s, cap=self.cap, anisotropic=anisotropic, axes=self.axes
+                sizes, scales, k_a=self.k_a, k_s=self.k_s, cap=self.cap, anisotropic=anisotropic, axes=self.axes
             )
 
         proposed = propose(sizes, self.anisotropic)
@@ -174,9 +174,9 @@ class Upscale(HostEvent):
             rule = {"budget_bytes": event_budget(self._budget_bytes, model.num_bytes, due.index, due.count)}
         else:
             rule = {self.select: getattr(self, self.select)}
-        mask = select(averages[:num], sizes, proposed, **rule)
+        mask = select(averages, sizes, proposed, **rule)
         grown = np.where(mask[:, None], proposed, sizes)
-        unused = self._unused(sizes[mask], scales[:num][mask])
+        unused = self._unused(sizes[mask], scales[mask])
         if self.select == "budget" and due.index == due.count and (grown == proposed).all():
             # The last event, and every proposal fits: the remaining bytes pay for further upscalings by the same rule,
             # then of both axes.
@@ -184,7 +184,7 @@ class Upscale(HostEvent):
             for anisotropic in (self.anisotropic, False):
                 while True:
                     proposed = propose(grown, anisotropic)
-                    mask = select(averages[:num], grown, proposed, budget_bytes=left)
+                    mask = select(averages, grown, proposed, budget_bytes=left)
                     if not mask.any():
                         break
                     larger = np.where(mask[:, None], proposed, grown)

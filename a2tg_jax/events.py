@@ -282,6 +282,23 @@ class HostEvent(Event):
         raise NotImplementedError(f"{type(self).__name__} must define apply(due, model, moments, state)")
 
 
+class FractionsEvent(HostEvent):
+    """Base class of events on the host at fractions of a stage, which keep the number of rows."""
+
+    at: tuple[float, ...]
+    with_end: ClassVar[bool] = False
+    """Whether the last fraction may be 1, the end of the stage."""
+
+    def check_options(self) -> None:
+        self.times(1)
+
+    def times(self, num_iterations: int) -> Times:
+        return times_at(self.at, num_iterations, with_end=self.with_end)
+
+    def num_programs(self, num_iterations: int) -> int:
+        return 2  # Tile lists grow with the Gaussians.
+
+
 def keep_rows(model: Model, moments: AdamState, state: object, is_kept: Array | np.ndarray) -> Change:
     """Return the change by an event on the host that removes Gaussians, so that no step is compiled again (host).
 

@@ -427,14 +427,14 @@ def degrees_of_sizes(sizes: np.ndarray, base_degree: int) -> np.ndarray:
 
 def empty_bands(degrees: ArrayLike, base_degree: int, dtype: DTypeLike = jnp.float32) -> Coefficients:
     """Return coefficients of zero for Gaussians of the given degrees [N] (host)."""
-    return Coefficients.allocate(sizes_of_degrees(np.asarray(degrees), base_degree), (0.0, 0.0, 0.0), dtype)
+    return Coefficients.allocate(sizes_of_degrees(np.asarray(degrees), base_degree), Coefficients.padding, dtype)
 
 
 def dense_bands(coefficients: Coefficients, base_degree: int) -> np.ndarray:
     """Return all coefficients above the base degree [N, K, 3], zeros above a Gaussian's degree; K is for degree 3
     (host)."""
-    dtype = coefficients.buckets[0].dtype if coefficients.buckets else np.float32
-    dense = np.zeros((coefficients.num, NUM_BASES[MAX_DEGREE] - NUM_BASES[base_degree], 3), dtype)
+    num_above = NUM_BASES[MAX_DEGREE] - NUM_BASES[base_degree]
+    dense = np.zeros((coefficients.num, num_above, 3), coefficients.dtype)
     for ids, blocks in coefficients.groups():
         dense[ids, : blocks.shape[1]] = blocks
     return dense

@@ -232,9 +232,9 @@ def _warn_of_outlying(shots: Sequence[Shot], poses: np.ndarray, cloud: PointClou
         if cloud is not None:
             points = evenly_chosen(cloud.points[are_somewhere(cloud.points)], FIRST_LOOK)
             for index in indices.tolist():
-                seen = shots[index].sight(poses[index]).depths_seen(points, 0.0)
-                if len(seen):
-                    depths.append(np.median(seen))
+                is_seen, of_points = shots[index].sight(poses[index]).seen(points, 0.0)
+                if is_seen.any():
+                    depths.append(np.median(of_points[is_seen]))
         return float(np.median(depths)) if depths else distance_to_subject(poses[indices])
 
     is_outlying = outlying_cameras(poses, distance_of)

@@ -21,7 +21,7 @@ from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.sh import NUM_BASES, directions_from, sh_basis
 from a2tg_jax.core.table import Layout, Size, resize
-from a2tg_jax.events import Change, Due, HostEvent, Seen, Times, times_at
+from a2tg_jax.events import Change, Due, FractionsEvent, Seen
 from a2tg_jax.model import Model
 
 
@@ -57,7 +57,7 @@ class BandStatistics:
 
 
 @pytree
-class AdaptDegrees(HostEvent):
+class AdaptDegrees(FractionsEvent):
     """Event that lowers idle degrees and raises others by one where the gradient per byte is largest, within a budget.
 
     It needs an appearance with `Bands`.
@@ -75,12 +75,9 @@ class AdaptDegrees(HostEvent):
     observes = True  # `Seen.colors`, which needs no statistic
 
     def check_options(self) -> None:
+        super().check_options()
         check_fields(self, "budget_mb", "idle", least=0)
         check_fields(self, "highest", least=0, most=MAX_DEGREE)
-        self.times(1)  # checks `at`
-
-    def times(self, num_iterations: int) -> Times:
-        return times_at(self.at, num_iterations)
 
     def num_programs(self, num_iterations: int) -> int:
         return 0  # `with_room` has made room, unless degrees may take more than half of the budget.

@@ -150,7 +150,7 @@ class KernelRates(NamedFields):
 
     def check_options(self) -> None:
         """Raise ValueError, beginning with the name of the field, if a rate is negative."""
-        check_fields(self, *(field.name for field in dataclasses.fields(self)), least=0)
+        check_fields(self, least=0)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

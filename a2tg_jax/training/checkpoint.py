@@ -251,15 +251,13 @@ def check_state(state: TrainState, expected: TrainState, stage: Stage) -> None:
     check_model(state.model)
     check_count("state.iteration", state.iteration, stage.iterations)
     check_count("state.status", state.status, EXPLODED)
-    check_count("state.moments.count", state.moments.count, np.iinfo(np.int32).max)
-    check_finite("state.moments.mu", state.moments.mu)
-    check_finite("state.moments.nu", state.moments.nu, is_signed=False)
+    for name, moments in (("", state.moments), *((".corrections", each.moments) for each in state.corrections)):
+        check_finite(f"state{name}.moments.mu", moments.mu)
+        check_finite(f"state{name}.moments.nu", moments.nu, is_signed=False)
+        if (np.asarray(moments.count) < 0).any():
+            raise ValueError(f"state{name}.moments.count must be at least 0; some are below")
     for correction in state.corrections:
         check_finite("state.corrections.rows", correction.rows)
-        check_finite("state.corrections.mu", correction.moments.mu)
-        check_finite("state.corrections.nu", correction.moments.nu, is_signed=False)
-        if (np.asarray(correction.moments.count) < 0).any():
-            raise ValueError("state.corrections.count must be at least 0; some are below")
     for path, leaf in jax.tree_util.tree_leaves_with_path(state.events):
         if np.isnan(np.asarray(leaf)).any():
             raise ValueError(f"state.events{jax.tree_util.keystr(path)} must be numbers; some are NaN")

@@ -6,6 +6,7 @@ dataclass that is a pytree of its numbers. V views.
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
@@ -17,6 +18,7 @@ from jax import Array
 from a2tg_jax.base.checks import check_fields
 from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.core.cameras import Camera, moved_viewmat
+from a2tg_jax.core.numerics import where_rows
 from a2tg_jax.core.optim import AdamState, adam_init, adam_update
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.pytree import pytree, static
@@ -235,9 +237,8 @@ def updated(
 
     # Adam would also move the rows of other views, by their moments.
     rows, moments = jax.tree.map(
-        lambda new, old: jnp.where(is_seen.reshape(-1, *[1] * (new.ndim - 1)), new, old),
-        (step.params, step.state), (state.rows, state.moments),
-    )  # fmt: skip
+        functools.partial(where_rows, is_seen), (step.params, step.state), (state.rows, state.moments)
+    )
     projected = correction.project(rows)
     check_kept(f"{type(correction).__name__}.project", projected, rows)
     return CorrectionState(projected, moments)

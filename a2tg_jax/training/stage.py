@@ -1,7 +1,6 @@
 """A stage: an appearance, events, loss terms, learning rates and a length. A system is a sequence of stages."""
 
 import bisect
-import dataclasses
 import functools
 import inspect
 import math
@@ -57,7 +56,7 @@ class LearningRates(NamedFields):
 
     def check_options(self) -> None:
         """Raise ValueError, beginning with the name of the field, if a rate is out of range."""
-        check_fields(self, *(field.name for field in dataclasses.fields(self)), least=0)
+        check_fields(self, least=0)
         check_fields(self, "means_final_factor", above=0)  # The decay is exponential.
 
     def of_gaussians(self, means: Array, sh_degree: int = 3) -> Gaussians:
