@@ -62,11 +62,6 @@ def multiples(every: int, first: int, last: int) -> Times:
     return range(-(-first // every) * every, last + 1, every)
 
 
-def every_iteration(num_iterations: int) -> Times:
-    """Return all iterations of a stage."""
-    return range(1, num_iterations + 1)
-
-
 class Seen(NamedTuple):
     """Views of one iteration, for events; V views, N rows."""
 
@@ -187,7 +182,8 @@ class Event(NamedFields):
 
     @property
     def observes(self) -> bool:
-        """Whether `observe` is called. Without a statistic, `Seen.gradients` and `is_visible` are zeros."""
+        """Whether `observe` is called. `Seen.gradients` and `is_visible` are zeros if no event of the stage gathers a
+        statistic."""
         return self.statistic is not None
 
     def init(self, model: Model) -> Any:
@@ -249,7 +245,7 @@ class StepEvent(Event):
 
     def times(self, num_iterations: int) -> Times:
         """Return the iterations after which the event happens; by default all (host)."""
-        return every_iteration(num_iterations)
+        return range(1, num_iterations + 1)
 
     def apply(self, now: Now, model: Model, moments: AdamState, state: Any) -> Change:
         """Return the model after the event; traced."""

@@ -24,7 +24,7 @@ from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.gaussians import Gaussians, no_rows
 from a2tg_jax.core.pytree import beside, check_pytree, pytree, static
 from a2tg_jax.core.sh import NUM_BASES
-from a2tg_jax.events import Event, HostEvent, StepEvent, Times, every_iteration
+from a2tg_jax.events import Event, HostEvent, StepEvent, Times
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.render_types import RenderOutput
@@ -271,8 +271,11 @@ class Stage(NamedFields):
     @property
     def lasting_events(self) -> tuple[Event, ...]:
         """Events that happen after every iteration, such as noise (host)."""
-        all_times = every_iteration(self.iterations)
-        return tuple(event for event, times in zip(self.events, self.times, strict=True) if times == all_times)
+        return tuple(event for event, times in zip(self.events, self.times, strict=True) if self._are_all(times))
+
+    def _are_all(self, times: Times) -> bool:
+        """Return whether times, which ascend, are all iterations."""
+        return len(times) == self.iterations and times[0] == 1 and times[-1] == self.iterations
 
     def clock(self, iteration: int, largest_loss: float = math.inf, stride: int = 1) -> "Clock":
         """Return the schedule of an iteration, whose step is not taken if its loss exceeds the largest. The step counts
@@ -280,7 +283,7 @@ class Stage(NamedFields):
         num_left: list[int | None] = []
         for event, times in zip(self.events, self.times, strict=True):
             # An event of every iteration needs no condition in the step.
-            if not isinstance(event, StepEvent) or times == every_iteration(self.iterations):
+            if not isinstance(event, StepEvent) or self._are_all(times):
                 num_left.append(None)
                 continue
             num_past = bisect.bisect_right(times, iteration)
