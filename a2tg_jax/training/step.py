@@ -278,7 +278,8 @@ def batch_gradients(
             color = jnp.where(mask[..., None], color, jnp.zeros_like(color))
         target = Target(view.camera, photograph, view.background, mask, clock.progress(iteration - 1), depth)
         output = dataclasses.replace(output, color=color)
-        parts_by_name: dict[str, Array] = {}
+        added = penalties(view.corrections, view.rows)
+        parts_by_name = {"corrections": functools.reduce(jnp.add, added)} if added else {}
         values: list[Array] = []
         for index, term in enumerate(stage.losses):
             if hasattr(term, "parts"):
@@ -289,9 +290,6 @@ def batch_gradients(
                 check_scalar(f"losses[{index}]", part)
                 parts_by_name[name if name not in parts_by_name else f"{name}_{index + 1}"] = part
             values.append(functools.reduce(jnp.add, parts.values()))
-        added = penalties(view.corrections, view.rows)
-        if added:
-            parts_by_name["corrections"] = functools.reduce(jnp.add, added)
         value = functools.reduce(jnp.add, [*values, *added])
         # PSNR is of what a screen shows; the loss is of unclipped colours (`losses`).
         error = jnp.mean((jnp.clip(output.color, 0, 1) - target.image) ** 2)
