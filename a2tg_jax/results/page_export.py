@@ -108,7 +108,7 @@ def _scene_lines(source: Source) -> list[str]:
     model = source.model
     size = len(source.encoded)
     ratio = f"1/{model.num_bytes / max(size, 1):.1f} of the model's {in_bytes(model.num_bytes)}"
-    lines = [f"{model.num:,} Gaussians, whose scene takes {in_bytes(size)}, {ratio}"]
+    lines = [f"{counted(model.num, 'Gaussian')}, whose scene takes {in_bytes(size)}, {ratio}"]
     if model.num:
         # The page's near plane.
         settings = dataclasses.replace(source.settings, near_plane=source.near_plane)
