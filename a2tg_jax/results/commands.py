@@ -27,7 +27,7 @@ def training_command(run: RunFolder, out: str, *flags: str) -> str:
     return shlex.join(["a2tg", "train", "--config", str(run.record), *flags, "--out", out])
 
 
-def beside(run: RunFolder, what: str) -> str:
+def next_to(run: RunFolder, what: str) -> str:
     """Return the path of another run folder next to one, with an addition to its name."""
     # "." and ".." have no name to add to.
     path = run.path if run.path.name not in ("", "..") else run.path.resolve()
@@ -36,10 +36,10 @@ def beside(run: RunFolder, what: str) -> str:
 
 def repeating_command(run: RunFolder) -> str:
     """Return the command that repeats a run, and its finishing, if any. Raises ValueError if finish.json is damaged."""
-    again = beside(run, "again")
+    again = next_to(run, "again")
     if not is_regular(run.finish):
         return training_command(run, again)
-    trained = beside(run, "trained")
+    trained = next_to(run, "trained")
     # It also names the source.
     given = read_object(run.finish)
     names = [field.name for field in dataclasses.fields(FinishOptions)]

@@ -75,7 +75,7 @@ def evaluate_run(run: RunFolder, scene: Scene | None = None, *, lpips_weights: P
     scene = scene or record.scene.load()
     files = {name: run.model(name) for name in finished}
     models = {name: load_model(files[name]) for name in finished}
-    histories = {name: read_history(run.history(name)) for name in finished}
+    histories = {}
     if not finished:
         files[planned.name], checkpoint = readable_checkpoint(run, planned)
         models[planned.name] = checkpoint.model_in(scene)
@@ -83,6 +83,7 @@ def evaluate_run(run: RunFolder, scene: Scene | None = None, *, lpips_weights: P
     # Before minutes of measuring.
     for name, model in models.items():
         check_held_out(model, scene, files[name])
+    histories |= {name: read_history(run.history(name)) for name in finished}
     results = {}
     for name, model in models.items():
         results[name] = ModelResult(
