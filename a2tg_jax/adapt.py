@@ -11,7 +11,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jax.typing import ArrayLike
 
-from a2tg_jax.base.checks import check_int, check_literal, check_number, check_shape
+from a2tg_jax.base.checks import check_fields, check_int, check_literal, check_number, check_shape
 from a2tg_jax.base.text import bytes_of
 from a2tg_jax.core.budget import MOST_ROOM, event_budget, within_budget
 from a2tg_jax.core.optim import AdamState
@@ -94,14 +94,11 @@ class Upscale(HostEvent):
         return self.gradient
 
     def check_options(self) -> None:
-        check_number("cap", self.cap, least=1, most=MAX_SIDE)
-        check_number("fraction", self.fraction, least=0, most=1)
-        check_number("k_a", self.k_a, least=1)
-        check_number("k_s", self.k_s, least=0)
-        if self.threshold is not None:
-            check_number("threshold", self.threshold, least=0)
-        if self.budget_mb is not None:
-            check_number("budget_mb", self.budget_mb, least=1e-6)
+        check_fields(self, "cap", least=1, most=MAX_SIDE)
+        check_fields(self, "fraction", least=0, most=1)
+        check_fields(self, "k_a", least=1)
+        check_fields(self, "k_s", "threshold", least=0)
+        check_fields(self, "budget_mb", least=1e-6)
         if self.select == "budget" and self.budget_mb is None:
             raise ValueError("select is 'budget', so it needs budget_mb, in MB (10^6 bytes)")
         if self.select == "threshold" and self.threshold is None:
@@ -161,15 +158,15 @@ class Upscale(HostEvent):
         textures = model.textures
         num = model.num
         old_sizes = textures.sizes
-        scales = np.asarray(model.gaussians.scales)
-        averages = np.asarray(state.average())
         # Only rows that exist can grow.
         sizes = old_sizes[:num]
+        scales = np.asarray(model.gaussians.scales)[:num]
+        averages = np.asarray(state.average())[:num]
         new_sizes = old_sizes.copy()
 
         def propose(sizes: np.ndarray, anisotropic: bool) -> np.ndarray:
             return next_sizes(
-                sizes, scales[:num], k_a=self.k_a, k_s=self.k_s, cap=self.cap, anisotropic=anisotropic, axes=self.axes
+                sizes, scales, k_a=self.k_a, k_s=self.k_s, cap=self.cap, anisotropic=anisotropic, axes=self.axes
             )
 
         proposed = propose(sizes, self.anisotropic)
@@ -177,9 +174,9 @@ class Upscale(HostEvent):
             rule = {"budget_bytes": event_budget(self._budget_bytes, model.num_bytes, due.index, due.count)}
         else:
             rule = {self.select: getattr(self, self.select)}
-        mask = select(averages[:num], sizes, proposed, **rule)
+        mask = select(averages, sizes, proposed, **rule)
         grown = np.where(mask[:, None], proposed, sizes)
-        unused = self._unused(sizes[mask], scales[:num][mask])
+        unused = self._unused(sizes[mask], scales[mask])
         if self.select == "budget" and due.index == due.count and (grown == proposed).all():
             # The last event, and every proposal fits: the remaining bytes pay for further upscalings by the same rule,
             # then of both axes.
@@ -187,7 +184,7 @@ class Upscale(HostEvent):
             for anisotropic in (self.anisotropic, False):
                 while True:
                     proposed = propose(grown, anisotropic)
-                    mask = select(averages[:num], grown, proposed, budget_bytes=left)
+                    mask = select(averages, grown, proposed, budget_bytes=left)
                     if not mask.any():
                         break
                     larger = np.where(mask[:, None], proposed, grown)

@@ -62,11 +62,6 @@ def multiples(every: int, first: int, last: int) -> Times:
     return range(-(-first // every) * every, last + 1, every)
 
 
-def every_iteration(num_iterations: int) -> Times:
-    """Return all iterations of a stage."""
-    return range(1, num_iterations + 1)
-
-
 class Seen(NamedTuple):
     """Views of one iteration, for events; V views, N rows."""
 
@@ -187,7 +182,8 @@ class Event(NamedFields):
 
     @property
     def observes(self) -> bool:
-        """Whether `observe` is called. Without a statistic, `Seen.gradients` and `is_visible` are zeros."""
+        """Whether `observe` is called. `Seen.gradients` and `is_visible` are zeros if no event of the stage gathers a
+        statistic."""
         return self.statistic is not None
 
     def init(self, model: Model) -> Any:
@@ -249,7 +245,7 @@ class StepEvent(Event):
 
     def times(self, num_iterations: int) -> Times:
         """Return the iterations after which the event happens; by default all (host)."""
-        return every_iteration(num_iterations)
+        return range(1, num_iterations + 1)
 
     def apply(self, now: Now, model: Model, moments: AdamState, state: Any) -> Change:
         """Return the model after the event; traced."""
@@ -280,6 +276,23 @@ class HostEvent(Event):
     def apply(self, due: Due, model: Model, moments: AdamState, state: Any) -> Change:
         """Return the model after the event (host)."""
         raise NotImplementedError(f"{type(self).__name__} must define apply(due, model, moments, state)")
+
+
+class FractionsEvent(HostEvent):
+    """Base class of events on the host at fractions of a stage, which keep the number of rows."""
+
+    at: tuple[float, ...]
+    with_end: ClassVar[bool] = False
+    """Whether the last fraction may be 1, the end of the stage."""
+
+    def check_options(self) -> None:
+        self.times(1)
+
+    def times(self, num_iterations: int) -> Times:
+        return times_at(self.at, num_iterations, with_end=self.with_end)
+
+    def num_programs(self, num_iterations: int) -> int:
+        return 2  # Tile lists grow with the Gaussians.
 
 
 def keep_rows(model: Model, moments: AdamState, state: object, is_kept: Array | np.ndarray) -> Change:

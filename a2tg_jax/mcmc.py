@@ -16,9 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.base.checks import check_count, check_number, check_shape
+from a2tg_jax.base.checks import check_count, check_fields, check_shape
 from a2tg_jax.core.budget import number_to_reach
 from a2tg_jax.core.gaussians import DEAD_OPACITY, MAX_SHARES, Gaussians, check_gaussians, share
+from a2tg_jax.core.numerics import where_rows
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.table import bucket_capacity
@@ -142,12 +143,8 @@ def plan_relocation(key: Array, opacities: Array, num_live: Array, draw: DrawHos
     is_host = is_live & (opacities > DEAD_OPACITY)
     is_dead = is_live & ~is_host
     has_hosts = jnp.any(is_host)
-    is_moved = is_dead & has_hosts
-    hosts = draw_hosts(key, opacities, is_host) if draw is None else draw(key, is_host, is_moved)
-    rows, num_draws = _copied_rows(hosts, is_moved)
     info = MoveInfo(jnp.sum(is_dead, dtype=jnp.int32), jnp.zeros((), jnp.int32), has_hosts)
-    # The host itself keeps one of the shares.
-    return Moves(rows, jnp.minimum(num_draws + 1, MAX_SHARES), num_draws > 0, info)
+    return _copies(key, opacities, is_host, is_dead & has_hosts, info, draw)
 
 
 def plan_growth(
@@ -169,10 +166,21 @@ def plan_growth(
     grown = jnp.minimum(jnp.asarray(cap, jnp.int32), grown)
     grown = jnp.where(has_hosts, jnp.maximum(grown, num_live), num_live)
     is_added = ~is_live & (index < grown)
-    hosts = draw_hosts(key, opacities, is_host) if draw is None else draw(key, is_host, is_added)
-    rows, num_draws = _copied_rows(hosts, is_added)
     info = MoveInfo(jnp.zeros((), jnp.int32), grown - num_live, has_hosts)
-    return Moves(rows, jnp.minimum(num_draws + 1, MAX_SHARES), (num_draws > 0) | is_added, info)
+    moves = _copies(key, opacities, is_host, is_added, info, draw)
+    return moves._replace(is_reset=moves.is_reset | is_added)
+
+
+def _copies(
+    key: Array, opacities: Array, is_host: Array, is_target: Array, info: MoveInfo, draw: DrawHosts | None
+) -> Moves:
+    """Plan copies of drawn hosts in the rows of the targets; moments of the hosts become zero."""
+    hosts = draw_hosts(key, opacities, is_host) if draw is None else draw(key, is_host, is_target)
+    index = jnp.arange(hosts.shape[0], dtype=jnp.int32)
+    num_draws = jnp.zeros(hosts.shape[0], jnp.int32).at[hosts].add(is_target.astype(jnp.int32))
+    # The host itself keeps one of the shares.
+    num_shares = jnp.minimum(num_draws + 1, MAX_SHARES)
+    return Moves(jnp.where(is_target, hosts, index), num_shares, num_draws > 0, info)
 
 
 def perturb(
@@ -256,21 +264,12 @@ def draw_hosts(key: Array, opacities: Array, is_host: Array) -> Array:
     return rows[jnp.clip(place, 0, jnp.maximum(num_hosts - 1, 0))].astype(jnp.int32)
 
 
-def _copied_rows(hosts: Array, is_target: Array) -> tuple[Array, Array]:
-    """Return [N] the row that each row copies, the host for targets, and [N] the number of its draws."""
-    num_draws = jnp.zeros(hosts.shape[0], jnp.int32).at[hosts].add(is_target.astype(jnp.int32))
-    return jnp.where(is_target, hosts, jnp.arange(hosts.shape[0], dtype=jnp.int32)), num_draws
-
-
 def _moved(gaussians: Gaussians, moments: Any, num_live: Array, moves: Moves) -> MoveResult:
     """Copy rows from their hosts after sharing, and clear their moments."""
     logits, scales = share(gaussians.logit_opacities, gaussians.log_scales, moves.num_shares)
     copied = dataclasses.replace(gaussians, logit_opacities=logits, log_scales=scales)[moves.rows]
     # The only leaf without rows is the number of Adam's updates.
-    moments = jax.tree.map(
-        lambda x: jnp.where(moves.is_reset.reshape(-1, *[1] * (x.ndim - 1)), jnp.zeros_like(x), x) if x.ndim else x,
-        moments,
-    )
+    moments = jax.tree.map(lambda x: where_rows(moves.is_reset, jnp.zeros_like(x), x) if x.ndim else x, moments)
     return MoveResult(copied, moments, num_live + moves.info.num_added, moves.info)
 
 
@@ -327,7 +326,7 @@ class Mcmc(StepEvent):
 
     def check_options(self) -> None:
         if self.cap:
-            check_number("cap", self.cap, least=2)
+            check_fields(self, "cap", least=2)
 
     def times(self, num_iterations: int) -> Times:
         return densify_times(num_iterations) if self.cap else ()
@@ -378,7 +377,7 @@ class FillingMcmc(Mcmc):
     """Variant of `Mcmc` that grows by more than 5 % where that is needed to reach the cap by its last event."""
 
     def check_options(self) -> None:
-        check_number("cap", self.cap, least=2)
+        check_fields(self, "cap", least=2)
 
     def num_rows(self, num: int, num_iterations: int) -> int:
         if num < self.cap and not self.times(num_iterations):

@@ -9,6 +9,7 @@ import json
 import os
 import sys
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -23,7 +24,7 @@ from a2tg_jax.base.archive import arrays_below, read_archive, write_archive
 from a2tg_jax.base.checks import check_shape
 from a2tg_jax.base.config_json import config_from_dict, config_to_dict
 from a2tg_jax.base.regular_files import reading
-from a2tg_jax.base.suffixes import check_suffix
+from a2tg_jax.base.suffixes import checked_path
 from a2tg_jax.base.text import shortened
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.origin import BLACK, Color, Origin
@@ -60,7 +61,7 @@ def save_model(path: str | os.PathLike[str], model: Model, header: Mapping[str, 
       >>> a2tg.load_model("scene.npz").num_bytes == model.num_bytes
       True
     """
-    check_suffix(path, "save_model")
+    path = checked_path(path, "save_model")
     model = checked_live(model)
     arrays = {name: np.asarray(getattr(model.gaussians, name)) for name in FIELDS}
     shown = arrays_of(model.appearance, model.gaussians.sh_degree)
@@ -93,7 +94,7 @@ def load_model(path: str | os.PathLike[str], *, appearances: Sequence[type[Appea
       >>> a2tg.load_model("scene.npz").render(camera).color.shape
       (36, 48, 3)
     """
-    check_suffix(path, "load_model")
+    path = checked_path(path, "load_model")
     header, arrays = read_archive(path, format=FORMAT)
     with reading(path):
         gaussians = Gaussians(**{name: arrays[name] for name in FIELDS})  # type: ignore[arg-type]
@@ -107,12 +108,12 @@ def load_model(path: str | os.PathLike[str], *, appearances: Sequence[type[Appea
         return model
 
 
-def number_in_file(path: str | os.PathLike[str]) -> int:
+def number_in_file(path: Path) -> int:
     """Return the number of Gaussians in a model file, by reading only their means. FileNotFoundError: there is no such
     file. ValueError: it is not a model, is damaged, or has another version."""
     # SH are most of a model's bytes.
     means = read_archive(path, format=FORMAT, names=("means",))[1]["means"]
-    check_shape(f"{os.fspath(path)}: means", means, ("N", 3))
+    check_shape(f"{path}: means", means, ("N", 3))
     return len(means)
 
 

@@ -5,7 +5,7 @@ training state (parameters, Adam's moments, statistics) are divided by rows wher
 as the places of textures, are whole on each device. XLA moves the rest: all parameters to each device before it draws,
 and the gradients of all views to the device that has the row, which sums them in the order of a single device.
 
-A mesh of None is one device, on which these functions return what they are given.
+A mesh of None is one device, on which these functions return what they are given; `everywhere` puts it there.
 """
 
 import zlib
@@ -115,7 +115,7 @@ def _of_first_process(mesh: Mesh, tree: T) -> T:
 
 def everywhere(mesh: Mesh | None, tree: T) -> T:
     """Return arrays that each device has whole, given the same in all processes."""
-    return tree if mesh is None else jax.tree.map(lambda x: _put(x, NamedSharding(mesh, P())), tree)
+    return jax.device_put(tree) if mesh is None else jax.tree.map(lambda x: _put(x, NamedSharding(mesh, P())), tree)
 
 
 def of_views(mesh: Mesh | None, batch: T) -> T:

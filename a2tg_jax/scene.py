@@ -3,7 +3,6 @@
 import dataclasses
 import html
 import math
-import warnings
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,6 +12,7 @@ from a2tg_jax.base.checks import check_array, check_kind, check_number, check_sh
 from a2tg_jax.base.even_spacing import evenly_chosen
 from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.text import counted, shortened
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.core.cameras import Camera, check_camera, check_is_camera
 from a2tg_jax.core.notebook_display import THUMBNAIL, enlarged, html_image, png
 from a2tg_jax.core.origin import BLACK, Origin
@@ -241,10 +241,9 @@ def view_image(view: View, background: Sequence[float] | np.ndarray | None = Non
     color = pixels[..., :3].astype(np.float32) / np.float32(255)
     if background is None:
         if view.has_alpha:
-            warnings.warn(
+            warn(
                 "the image is transparent and was put on black: use view_image(view, model.background) to compare it "
-                "with a model, or give another background",
-                stacklevel=2,
+                "with a model, or give another background"
             )
         background = BLACK
     check_shape("background", background, color.shape if np.ndim(background) == 3 else (3,))

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike, DTypeLike
 
-from a2tg_jax.base.checks import check_number, check_unmasked, plain_array
+from a2tg_jax.base.checks import check_floats, check_number, check_unmasked, plain_array
 from a2tg_jax.core.pytree import pytree
 from a2tg_jax.core.table import Size, Table, check_table
 
@@ -121,10 +121,7 @@ def textures_from_arrays(arrays: Sequence[ArrayLike]) -> Textures:
     """
     textures = [np.asarray(plain_array(f"texture {index}", array)) for index, array in enumerate(arrays)]
     for index, array in enumerate(textures):
-        if array.ndim != 3 or array.shape[2] != 4:
-            raise ValueError(f"texture {index} must be [Tv, Tu, 4]; got {array.shape}")
-        if not jnp.issubdtype(array.dtype, jnp.floating):
-            raise ValueError(f"texture {index} must be floats; got {array.dtype}")
+        check_floats(f"texture {index}", array, ("Tv", "Tu", 4))
     sizes = checked_sizes(np.array([array.shape[:2] for array in textures], int).reshape(-1, 2))
     # Gives the result its dtype and number of channels if there are no textures.
     empty = np.zeros((0, 4), textures[0].dtype if textures else np.float32)

@@ -234,6 +234,16 @@ def test_other_appearances_give_their_gaussians():
         bake(model, [CAMERA], growth=0.5, iterations=0)
 
 
+@pytest.mark.filterwarnings("ignore::a2tg_jax.rasterize.room.EmptyRenderWarning")
+def test_few_gaussians_are_baked():
+    model = textured()
+    with pytest.raises(ValueError, match="no Gaussians to bake"):
+        bake(model[np.zeros(model.num, bool)], [CAMERA], growth=2.0, iterations=3)
+    single = model.with_textures(textures_from_arrays([np.zeros((1, 1, 4), np.float32)] * model.num))
+    single = single[np.arange(model.num) == 0]
+    assert bake(single, [CAMERA], growth=1.0, iterations=3).num == 1
+
+
 @pytest.mark.long
 def test_convert_bakes(tmp_path, capsys):
     model = textured()

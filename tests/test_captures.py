@@ -26,6 +26,7 @@ from test_data_transforms import (
 
 from a2tg_jax import load_scene
 from a2tg_jax.data import decoding
+from a2tg_jax.data.load import SceneSource
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*sparse points; starts from")
 COUNT = 4
@@ -337,6 +338,11 @@ def test_xml_of_too_many_elements_or_with_entities_in_another_encoding_is_refuse
     xmp.write_bytes(b"<xcr:Rotation>" + b"<a>" * 500_000)
     with pytest.raises(ValueError, match=r"0\.xmp: cannot be read as XML \(it has 500,001 tags; the limit is 500,000"):
         load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["", "cameras.xml", "CAMERAS.XML", "images/Transforms.JSON"])
+def test_a_scene_has_the_name_of_its_folder(tmp_path, name):
+    assert SceneSource(str(tmp_path / "toy" / name)).name == ("toy/images" if "/" in name else "toy")
 
 
 def realityscan_xmp(pose, position=(0, 0, 0), more='xcr:DistortionCoeficients="-0.1 0.02 0 0 0 0"'):

@@ -601,7 +601,7 @@ def test_a_killed_finish_continues_with_the_same_command(run, tmp_path, monkeypa
     """From the evaluation on, once the model is written; a finish with other options does not continue there."""
     polished, new = [], RunFolder(tmp_path / "new")
     monkeypatch.setattr(SceneSource, "load", lambda self: SimpleNamespace(train=()))
-    monkeypatch.setattr(finishing, "_measured", lambda model, *_: finishing.Measured(model.num_bytes, 20.0, None))
+    monkeypatch.setattr(finishing, "_measured", lambda model, *_: finishing.Measured(model, 20.0, None))
     monkeypatch.setattr(finishing, "polish", lambda model, *_, **__: polished.append(1) or model)
     monkeypatch.setattr(finishing, "evaluate_run", lambda run, *_, **__: run.own(run.report).touch())
     command = ["finish", str(run.path), "--out", str(new.path), "--max-loss", "0"]
@@ -639,7 +639,7 @@ def test_an_overtaken_finish_deletes_nothing(run, tmp_path, monkeypatch, capsys)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(SceneSource, "load", load)
-    monkeypatch.setattr(finishing, "_measured", lambda model, *_: finishing.Measured(model.num_bytes, 20.0, None))
+    monkeypatch.setattr(finishing, "_measured", lambda model, *_: finishing.Measured(model, 20.0, None))
     monkeypatch.setattr(finishing, "_changed", lambda model, *_: iter([("polished", model)]))
     monkeypatch.setattr(finishing, "evaluate_run", lambda run, *_, **__: run.own(run.report).touch())
     with monkeypatch.context() as patch:
@@ -652,7 +652,7 @@ def test_an_overtaken_finish_deletes_nothing(run, tmp_path, monkeypatch, capsys)
 
 def test_a_step_that_loses_quality_is_left_out():
     def steps(*psnrs):
-        return {name: finishing.Measured(1, psnr, None) for name, psnr in psnrs}
+        return {name: finishing.Measured(None, psnr, None) for name, psnr in psnrs}
 
     assert finishing.kept_step(steps(("before", 20.0), ("shrunk", 19.9), ("polished", 20.1))) == "polished"
     assert finishing.kept_step(steps(("before", 20.0), ("shrunk", 19.9), ("polished", 19.8))) == "shrunk"

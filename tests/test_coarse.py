@@ -163,14 +163,13 @@ def test_more_iterations_see_whole_photographs():
     assert [stage.num_coarse for stage in system.all_stages()] == [12, 0]
 
 
+@pytest.mark.usefixtures("small_ones_are_halved")
 def test_masks_of_which_no_four_pixels_count(tmp_path):
     """No pixel of the halved photographs counts, so that there is no error."""
     is_odd = np.indices((18, 24)).sum(0) % 2 == 1
     masked = dataclasses.replace(SMALL, train=tuple(dataclasses.replace(view, mask=is_odd) for view in SMALL.train))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(loop, "LEAST_HALVED", 16)
-        system = a2tg.Gaussians2dMcmc.preset("smoke", stage1_iterations=10, coarse_share=1.0, loss={"ssim_weight": 0.0})
-        result = a2tg.fit(masked, system)
+    system = a2tg.Gaussians2dMcmc.preset("smoke", stage1_iterations=10, coarse_share=1.0, loss={"ssim_weight": 0.0})
+    result = a2tg.fit(masked, system)
     assert result.history.psnr.tolist() == [np.inf] and result.history.loss.tolist() == [0]
     a2tg.save_checkpoint(tmp_path / "checkpoint.npz", result.checkpoint)
     assert a2tg.load_checkpoint(tmp_path / "checkpoint.npz").history.psnr.tolist() == [np.inf]

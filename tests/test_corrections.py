@@ -11,8 +11,10 @@ from scipy.linalg import expm
 from toy_system import Toy
 
 from a2tg_jax import (
+    Appearance,
     Camera,
     CloneSplitPrune,
+    Corrections,
     Exposure,
     Gaussians2d,
     Gaussians2dMcmc,
@@ -20,6 +22,9 @@ from a2tg_jax import (
     Mcmc,
     Origin,
     PoseRefinement,
+    Stage,
+    System,
+    Term,
     adam_init,
     adam_update,
     find_system,
@@ -175,6 +180,21 @@ def test_cameras_are_made_once_for_all_corrections(scene, monkeypatch):
     corrected = corrected_origin(scene.origin, corrections, states)
     np.testing.assert_allclose(corrected.viewmats, scene.origin.viewmats, atol=1e-6)
     assert len(calls) == 1
+
+
+def test_a_loss_term_of_the_same_name_as_their_penalties_is_recorded(scene):
+    def corrections(model, target, output):
+        return jnp.mean(jnp.abs(output.color - target.image))
+
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Own(System):
+        def stages(self):
+            return (Stage("own", Appearance(), (), (Term(corrections),), self.rates, 10, None, self.corrections_of()),)
+
+    history = fit(scene, Own(sh_degree=0, exposure=True, corrections=Corrections(exposure_kind="grid"))).history
+    assert set(history.terms) == {"corrections", "corrections_1"}
+    np.testing.assert_allclose(sum(history.terms.values()), history.loss, rtol=1e-6)
+    assert history.terms["corrections_1"] > 100 * history.terms["corrections"]
 
 
 def test_a_checkpoint_of_another_number_of_views_is_refused(scene, trained):

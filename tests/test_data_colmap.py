@@ -148,8 +148,9 @@ def test_images_without_a_pose_are_counted(tmp_path):
     for name in ("notes.txt", "._img_00.png", "@eaDir/zzz.png/thumb.jpg", ".cache/zzz.png"):
         (tmp_path / "images" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "images" / name).touch()
-    with pytest.warns(UserWarning, match=r"images: 1 photograph without a pose, such as zzz\.png: not us"):
+    with pytest.warns(UserWarning, match=r"images: 1 photograph without a pose, such as zzz\.png: not us") as caught:
         assert len(load_scene(tmp_path).train) == 7
+    assert caught[0].filename == __file__, "the line that called the package"
 
 
 def test_alpha_and_greyscale(tmp_path):

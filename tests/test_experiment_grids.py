@@ -171,6 +171,13 @@ def test_scenes_of_ones_own_take_the_place_of_the_scales(tmp_path):
         own_scene(tmp_path / "nowhere", 1)
     with pytest.raises(ValueError, match="at least 1"):
         own_scene(tmp_path / "garden", 0)
+    other = tmp_path / "other" / "garden"
+    other.mkdir(parents=True)
+    words = ["--out", str(tmp_path / "out"), *2 * ["--scene", str(tmp_path / "garden")]]
+    assert len(Lab(argument_parser("").parse_args(words)).own_scenes) == 1
+    lab = Lab(argument_parser("").parse_args([*words, "--scene", str(other)]))
+    with pytest.raises(ValueError, match="two folders of --scene are called garden"):
+        lab.grid("fixed_memory")
 
 
 OWN_GRID = """

@@ -42,6 +42,7 @@ def test_the_sign_flip_test_is_scipys_exact_permutation_test():
     )
     assert sign_flip(values) == pytest.approx(wanted.pvalue)
     assert sign_flip(np.arange(1.0, 9.0)) == 2 / 256, "only both extremes"
+    assert sign_flip(np.arange(1.0, 23.0)) == 2 / 2**22, "of many scenes without a table of all signs"
 
 
 def test_the_interval_is_that_of_students_t():

@@ -4,6 +4,7 @@ import base64
 import dataclasses
 import json
 import zipfile
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -144,7 +145,7 @@ def test_cut_colours_and_scales_are_counted(tmp_path, suffix, num):
     save_splats(tmp_path / f"a{suffix}", Model(g))
     found = matched(load_splats(tmp_path / f"a{suffix}"), Model(g)).gaussians
     changed = np.abs(np.asarray(found.sh) - np.asarray(sh)[:, : found.sh.shape[1]]) > 0.3
-    lost = lost_by(Model(g), f"a{suffix}")
+    lost = lost_by(Model(g), Path(f"a{suffix}"))
     assert np.count_nonzero(changed.any(axis=(1, 2))) == num
     assert f"colours of {num} Gaussians beyond the format's range (cut)" in lost
     printed = "scales of 2 Gaussians beyond the format's range (cut)"
@@ -161,29 +162,29 @@ def test_what_a_format_does_not_keep():
     world = Similarity(2.0, np.eye(3), np.zeros(3))
     camera = Camera(jnp.eye(4), jnp.eye(3), 8, 8)
     model = dataclasses.replace(textured(), origin=Origin.of_cameras([camera], transform=world))
-    assert lost_by(model, "a.npz") == []
-    assert lost_by(model, "a.ply") == [TEXTURES, "cameras and background"]
-    assert lost_by(model, "a.SPZ") == [TEXTURES, CUT, "cameras and background", "last digits"]
-    assert "spherical harmonics above degree 2" in lost_by(Model(some_gaussians()), "a.ksplat")
-    assert lost_by(Model(some_gaussians(), background=(1.0, 1.0, 1.0)), "a.ply") == ["background"]
-    assert lost_by(Model(some_gaussians()), "a.splat") == ["spherical harmonics above degree 0", "last digits"]
+    assert lost_by(model, Path("a.npz")) == []
+    assert lost_by(model, Path("a.ply")) == [TEXTURES, "cameras and background"]
+    assert lost_by(model, Path("a.SPZ")) == [TEXTURES, CUT, "cameras and background", "last digits"]
+    assert "spherical harmonics above degree 2" in lost_by(Model(some_gaussians()), Path("a.ksplat"))
+    assert lost_by(Model(some_gaussians(), background=(1.0, 1.0, 1.0)), Path("a.ply")) == ["background"]
+    assert lost_by(Model(some_gaussians()), Path("a.splat")) == ["spherical harmonics above degree 0", "last digits"]
     shaped = showing(Appearance(texture=Texture(), exponents=Exponents()))
-    assert lost_by(shaped, "a.ply") == ["textures and shapes of kernels (bake turns them into plain splats)"]
-    assert lost_by(shaped, "a.glb") == lost_by(shaped, "a.a2tgz") == ["last digits"]
+    assert lost_by(shaped, Path("a.ply")) == ["textures and shapes of kernels (bake turns them into plain splats)"]
+    assert lost_by(shaped, Path("a.glb")) == lost_by(shaped, Path("a.a2tgz")) == ["last digits"]
     unseen = "textures and shapes of kernels (bake turns them into plain splats)"
-    assert unseen_elsewhere(shaped, "a.glb") == unseen
-    assert unseen_elsewhere(shaped, "a.a2tgz") == unseen_elsewhere(Model(some_gaussians()), "a.glb") == ""
+    assert unseen_elsewhere(shaped, Path("a.glb")) == unseen
+    assert unseen_elsewhere(shaped, Path("a.a2tgz")) == unseen_elsewhere(Model(some_gaussians()), Path("a.glb")) == ""
     kernels = showing(Appearance(exponents=Exponents()))
-    assert lost_by(kernels, "a.usda")[0] == "shapes of kernels (bake turns them into plain splats)"
-    found = lost_by(showing(movable_kernels(exponents=Exponents())), "a.ply")
-    assert found == [lost_by(kernels, "a.ply")[0], "what MovableKernels shows besides Gaussians"]
+    assert lost_by(kernels, Path("a.usda"))[0] == "shapes of kernels (bake turns them into plain splats)"
+    found = lost_by(showing(movable_kernels(exponents=Exponents())), Path("a.ply"))
+    assert found == [lost_by(kernels, Path("a.ply"))[0], "what MovableKernels shows besides Gaussians"]
     learned = {"exposure": np.zeros((0, 3, 4)), "pose": np.zeros((0, 6))}
     model = Model(some_gaussians(), origin=dataclasses.replace(model.origin, corrections=learned))
-    assert lost_by(model, "a.npz") == []
-    assert lost_by(model, "a.glb") == ["learned exposures", "learned motions of cameras", "last digits"]
-    assert format_of("a.compressed.ply").name != format_of("a.ply").name
+    assert lost_by(model, Path("a.npz")) == []
+    assert lost_by(model, Path("a.glb")) == ["learned exposures", "learned motions of cameras", "last digits"]
+    assert format_of(Path("a.compressed.ply")).name != format_of(Path("a.ply")).name
     with pytest.raises(ValueError, match=r"known are \.npz"):
-        format_of("a.xyz")
+        format_of(Path("a.xyz"))
 
 
 @pytest.mark.parametrize("data", [b"", b"glXF\x02\xb0\xff", b"{"])

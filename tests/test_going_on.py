@@ -362,3 +362,20 @@ def test_a_damaged_record_of_the_views_is_named(middle, tmp_path, name):
 def test_training_is_not_traced(call):
     with pytest.raises(ValueError, match=r"^fit reads values and compiles its own steps, so it cannot be traced"):
         jax.jit(lambda x: x * call().model.gaussians.means)(2.0)
+
+
+@pytest.mark.parametrize("kind", [tuple, list, lambda times: times], ids=["tuple", "list", "range"])
+def test_events_of_every_iteration_go_on_however_their_times_are_given(kind):
+    @a2tg.pytree
+    class Always(a2tg.StepEvent):
+        def times(self, num_iterations):
+            return kind(range(1, num_iterations + 1))
+
+    @a2tg.pytree
+    class Nearly(a2tg.StepEvent):
+        def times(self, num_iterations):
+            return kind(range(1, num_iterations))
+
+    stage = dataclasses.replace(SYSTEM.stages()[0], events=(Always(), Nearly()))
+    assert stage.lasting_events == (Always(),)
+    assert stage.clock(1).num_left == (None, 149)

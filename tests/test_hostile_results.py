@@ -58,13 +58,13 @@ def test_json_made_to_do_harm(tmp_path, text):
 def test_histories_that_are_none(tmp_path, text):
     file = tmp_path / "a.csv"
     file.write_text(text)
-    with pytest.raises(ValueError, match=r"a\.csv: .*train the stage again") as caught:
+    with pytest.raises(ValueError, match=r"a\.csv: .*delete models/a\.npz to train the stage again") as caught:
         read_history(file)
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 500
 
 
 def test_a_history_may_be_missing_or_without_rows(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"a\.csv is missing: .*train the stage again"):
+    with pytest.raises(FileNotFoundError, match=r"a\.csv is missing: .*delete models/a\.npz to train the stage again"):
         read_history(tmp_path / "a.csv")
     write_history(tmp_path / "a.csv", History.empty())
     found = read_history(tmp_path / "a.csv")

@@ -1,5 +1,6 @@
 """`a2tg make`, from photographs to a page, and the training that fits into given minutes."""
 
+import dataclasses
 import json
 import re
 import signal
@@ -10,11 +11,13 @@ import numpy as np
 import pytest
 from jax.experimental.compilation_cache.compilation_cache import reset_cache
 from PIL import Image
+from run_folders import circle
 
 import a2tg_jax as a2tg
 from a2tg_jax.cli import main as cli, make
 from a2tg_jax.host.signals import Stopped
 from a2tg_jax.results.folder import RunFolder
+from a2tg_jax.results.frames import unseen_angle
 from a2tg_jax.results.images import save_picture
 from a2tg_jax.results.minutes import Speed, TimedTraining, measured_speed, training_within
 from a2tg_jax.results.record import read_record
@@ -229,6 +232,18 @@ def test_a_folder_with_a_dot_gives_its_whole_name(tmp_path, monkeypatch, capsys)
     Path("fox.v2").mkdir()
     is_answered(capsys, ["fox.v2"], "enough")
     assert Path("runs/fox.v2").is_dir()
+
+
+def test_cameras_that_look_outwards_surround_no_subject():
+    """a2tg make must not choose an orbit for a room that was photographed from its middle."""
+    inward = circle(12)
+    turned = np.diag([-1.0, 1.0, -1.0, 1.0])
+    outward = [dataclasses.replace(camera, viewmat=turned @ np.asarray(camera.viewmat)) for camera in inward]
+    names = [str(index) for index in range(12)]
+    assert unseen_angle(a2tg.Origin.of_cameras(inward, names)) == pytest.approx(np.pi / 6)
+    assert unseen_angle(a2tg.Origin.of_cameras(outward, names)) == 2 * np.pi
+    with pytest.raises(ValueError, match="`path` smooth"):
+        a2tg.turntable(outward, 3)
 
 
 def test_another_video_is_noticed(tmp_path, monkeypatch, capsys):

@@ -142,6 +142,11 @@ COMMANDS = {
     "compress done --out photos": "--out … .a2tgz … got photos",
     "convert done done/models/a2tg-textures.npz --overwrite": "a2tg-textures.npz … belongs",
     "edit done --floaters 40": "--out FILE",
+    "edit done --out folder.json --floaters 40": "folder.json is a folder; give the path of a file … --out",
+    "mesh done --out folder.glb": "folder.glb is a folder; give the path of a file … --out",
+    "compress done --out folder.a2tgz": "folder.a2tgz is a folder; give the path of a file … --out",
+    "compare done done --out folder.html": "folder.html is a folder; give the path of a file … --out",
+    "convert done folder.ply": "folder.ply is a folder; give the path of a file … OUT",
     "edit nowhere --out e.json --floaters 40": "nowhere",
     "edit photo.png --out e.json --croop 0:1 0:1 0:1": "--croop … --crop LOW:HIGH",
     "compare done": "RUN_OR_FILE",
@@ -187,6 +192,8 @@ def place(tmp_path_factory):
     for name in ("photos/a", "scene/a", "photo", "many/a", "many/b", "many/c"):
         (place / name).parent.mkdir(exist_ok=True)
         Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(place / f"{name}.png")
+    for suffix in ("json", "glb", "a2tgz", "html", "ply"):
+        (place / f"folder.{suffix}").mkdir()
     (place / "scene/transforms.json").write_text(json.dumps({"frames": []}))
     (place / "bad.toml").write_text("scene = {")
     (place / "wrong.toml").write_text('scenes = "synthetic"')

@@ -38,6 +38,7 @@ from a2tg_jax import (
 )
 from a2tg_jax.base.atomic import replacing, write_whole
 from a2tg_jax.base.machine import this_machine
+from a2tg_jax.base.regular_files import sha256_of
 from a2tg_jax.cli import main as cli
 from a2tg_jax.host.errors import error_text
 from a2tg_jax.results import compression, run_evaluation, run_training, stage_training
@@ -775,6 +776,10 @@ def test_an_older_checkpoint_is_shown_if_the_newest_is_damaged(stopped, tmp_path
         shown = open_source(run.path).model
     assert any(f"{newest.name}: " in str(one.message) and older.name in str(one.message) for one in caught)
     assert_same_bits(shown, load_checkpoint(older).model_in(SOURCE.load()))
+    with pytest.warns(UserWarning, match=rf"{newest.name}: .*; {older.name} is taken instead"):
+        result = run_evaluation.evaluate_run(run)
+    assert result.models[NAME].sha256 == sha256_of(older)
+    assert result.models[NAME].seconds == load_checkpoint(older).history.last_seconds
     for path in (*oldest, older):
         path.unlink()
     with pytest.raises(ValueError, match=newest.name):

@@ -92,6 +92,14 @@ def test_a_command_takes_the_home_folder(home, words):
     assert home / "out" in [path for value in found for path in (value if isinstance(value, tuple) else [value])]
 
 
+def test_only_a_path_is_no_url():
+    title = "https://host/fox"
+    assert parsed("export", ["run", "--web", "page", "--title", title]).title == title
+    for words in (["export", title, "--web", "page"], ["export", "run", f"--web={title}"], ["sfm", "a", title]):
+        with pytest.raises(ValueError, match="is a URL"):
+            parsed(words[0], words[1:])
+
+
 def test_training_takes_the_home_folder(home):
     (home / "run.toml").write_text('scene = "~/scene"\nsystem = "a2tg"\ninit = "~/start.ply"\n')
     record = read_run_file(home / "run.toml")

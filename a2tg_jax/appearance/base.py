@@ -41,7 +41,7 @@ from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians, logit, share
 from a2tg_jax.core.geometry import homographies_of
-from a2tg_jax.core.numerics import Integer, at_least
+from a2tg_jax.core.numerics import Integer, at_least, where_rows
 from a2tg_jax.core.pytree import is_shared, partition, pytree, static
 from a2tg_jax.core.sh import sh_sum
 from a2tg_jax.core.table import Table, check_places, check_table, is_held, is_whole, map_rows, rows_moved
@@ -479,11 +479,9 @@ def check_arrays_given(appearance: Appearance) -> None:
 
 def clear_rows(tree: T, is_cleared: Array) -> T:
     """Return moments with the rows of marked Gaussians [N] at zero; traceable. Tables must have their places."""
-
-    def cleared(array: Array) -> Array:
-        return jnp.where(is_cleared.reshape(-1, *[1] * (array.ndim - 1)), jnp.zeros_like(array), array)
-
-    return map_rows(cleared, lambda table: table.clear(is_cleared), tree)
+    return map_rows(
+        lambda array: where_rows(is_cleared, jnp.zeros_like(array), array), lambda table: table.clear(is_cleared), tree
+    )
 
 
 def take_rows(tree: T, rows: np.ndarray) -> T:

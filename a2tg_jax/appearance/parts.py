@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike, DTypeLike
 
-from a2tg_jax.base.checks import check_number, check_shape
+from a2tg_jax.base.checks import check_fields, check_shape
 from a2tg_jax.base.config_json import check_config
 from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.core.bilinear import TextureRegion
@@ -91,12 +91,12 @@ class TextureOptions(NamedFields):
     def __post_init__(self) -> None:
         """Check the conventions and the extent."""
         check_config(self)
-        check_number("extent", self.extent, least=LEAST_EXTENT, most=MOST_EXTENT)
+        check_fields(self, "extent", least=LEAST_EXTENT, most=MOST_EXTENT)
 
     def check_options(self) -> None:
         """Raise ValueError, beginning with the name of the field, if a number is out of range."""
-        check_number("initial_rgb", self.initial_rgb, least=-1, most=1)
-        check_number("max_alpha", self.max_alpha, least=1e-3, most=0.9999)
+        check_fields(self, "initial_rgb", least=-1, most=1)
+        check_fields(self, "max_alpha", least=1e-3, most=0.9999)
 
     @staticmethod
     def official() -> "TextureOptions":
@@ -427,14 +427,14 @@ def degrees_of_sizes(sizes: np.ndarray, base_degree: int) -> np.ndarray:
 
 def empty_bands(degrees: ArrayLike, base_degree: int, dtype: DTypeLike = jnp.float32) -> Coefficients:
     """Return coefficients of zero for Gaussians of the given degrees [N] (host)."""
-    return Coefficients.allocate(sizes_of_degrees(np.asarray(degrees), base_degree), (0.0, 0.0, 0.0), dtype)
+    return Coefficients.allocate(sizes_of_degrees(np.asarray(degrees), base_degree), Coefficients.padding, dtype)
 
 
 def dense_bands(coefficients: Coefficients, base_degree: int) -> np.ndarray:
     """Return all coefficients above the base degree [N, K, 3], zeros above a Gaussian's degree; K is for degree 3
     (host)."""
-    dtype = coefficients.buckets[0].dtype if coefficients.buckets else np.float32
-    dense = np.zeros((coefficients.num, NUM_BASES[MAX_DEGREE] - NUM_BASES[base_degree], 3), dtype)
+    num_above = NUM_BASES[MAX_DEGREE] - NUM_BASES[base_degree]
+    dense = np.zeros((coefficients.num, num_above, 3), coefficients.dtype)
     for ids, blocks in coefficients.groups():
         dense[ids, : blocks.shape[1]] = blocks
     return dense

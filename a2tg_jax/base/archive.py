@@ -4,8 +4,8 @@ The entry "header" is JSON text as bytes; its "format" and "version" identify th
 """
 
 import json
-import os
 from collections.abc import Collection, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ import numpy as np
 from a2tg_jax.base.atomic import replacing
 from a2tg_jax.base.json_text import parse_json
 from a2tg_jax.base.npz import read_npz
-from a2tg_jax.base.regular_files import check_exists, expanded
+from a2tg_jax.base.regular_files import check_exists
 from a2tg_jax.base.text import shortened
 
 FORMAT = "a2tg-jax checkpoint"
@@ -22,7 +22,7 @@ HEADER = "header"
 
 
 def write_archive(
-    path: str | os.PathLike[str],
+    path: Path,
     header: Mapping[str, object],
     arrays: Mapping[str, np.ndarray],
     *,
@@ -41,16 +41,15 @@ def write_archive(
     # The header is bytes, not a NumPy string: `read_npz` accepts numbers only.
     entries = {HEADER: np.frombuffer(text.encode(), np.uint8), **{name: np.asarray(a) for name, a in arrays.items()}}
     # An open file, because NumPy appends .npz to paths without it, and `replacing` would not find the result.
-    with replacing(expanded(path)) as temporary, open(temporary, "wb") as file:
+    with replacing(path) as temporary, open(temporary, "wb") as file:
         np.savez(file, **entries)  # type: ignore[arg-type]
 
 
 def read_archive(
-    path: str | os.PathLike[str], *, format: str = FORMAT, names: Collection[str] | None = None
+    path: Path, *, format: str = FORMAT, names: Collection[str] | None = None
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Return the header and the arrays of `write_archive`; `names` selects arrays. FileNotFoundError: there is no such
     file. ValueError: it is not such an archive, is damaged, lacks one of the names, or has another version."""
-    path = expanded(path)
     # Naming a run folder instead of its model is a likely mistake.
     if path.is_dir():
         models = sorted(path.glob("models/*.npz"))
@@ -81,7 +80,7 @@ def read_archive(
     return header, arrays
 
 
-def read_archive_header(path: str | os.PathLike[str], *, format: str = FORMAT) -> dict[str, Any]:
+def read_archive_header(path: Path, *, format: str = FORMAT) -> dict[str, Any]:
     """Return the header, without reading the arrays. Raises as `read_archive` does."""
     return read_archive(path, format=format, names=())[0]
 

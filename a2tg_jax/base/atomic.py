@@ -25,7 +25,7 @@ NO_ROOM = frozenset({errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC)})
 
 
 @contextlib.contextmanager
-def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
+def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary path next to `path` to write to, and rename it to `path` if the block succeeds.
 
     If the process is killed or the machine loses power, the old file or none is left, never half of one. Missing parent
@@ -54,14 +54,13 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def file_to_write(path: str | os.PathLike[str]) -> Path:
+def file_to_write(path: Path) -> Path:
     """Return the path itself or, if it is a link, the file that it leads to, which need not exist.
 
     Raises:
       OSError: if links lead in a circle, to a device, a pipe or a socket, which renaming would replace, or to a folder
         that does not exist, such as on a disk that is not mounted.
     """
-    path = Path(path)
     for folder in path.parents:
         if folder.is_symlink() and not folder.exists():
             raise FileNotFoundError(f"{folder} is a link to {os.readlink(folder)}, which does not exist: make it first")
@@ -80,7 +79,7 @@ def file_to_write(path: str | os.PathLike[str]) -> Path:
     return target
 
 
-def write_whole(path: str | os.PathLike[str], data: bytes | str) -> None:
+def write_whole(path: Path, data: bytes | str) -> None:
     """Write a file as `replacing` does; text is written as UTF-8, with line ends as they are."""
     with replacing(path) as temporary:
         temporary.write_bytes(data.encode() if isinstance(data, str) else data)

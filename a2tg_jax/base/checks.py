@@ -113,6 +113,24 @@ def check_number(
         raise ValueError(f"{name} must be {wanted or 'a number'}; got {value!r}")
 
 
+def check_fields(instance: Any, *names: str, **limits: float) -> None:
+    """Check numbers of a dataclass by the names of their fields, or all fields, as `check_number` does; None passes,
+    which other checks refuse where it may not be (`check_config`)."""
+    for name in names or [field.name for field in dataclasses.fields(instance)]:
+        value = getattr(instance, name)
+        if value is not None:
+            check_number(name, value, **limits)
+
+
+def check_groups(config: Any) -> None:
+    """Call the method `check_options` of each field of a dataclass that has one; errors begin with the field's name."""
+    for field in dataclasses.fields(config):
+        check = getattr(getattr(config, field.name), "check_options", None)
+        if check is not None:
+            with fields_of(field.name):
+                check()
+
+
 def check_numeric(name: str, value: object) -> None:
     """Raise ValueError unless a value is a number or an array of numbers of any shape; none is read."""
     if not _is_numeric(value):

@@ -5,6 +5,7 @@ import math
 import os
 import zipfile
 from collections.abc import Callable
+from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
@@ -18,9 +19,7 @@ CHUNK = 1 << 24
 LONGEST_REASON = 200
 
 
-def read_npz(
-    path: str | os.PathLike[str], is_wanted: Callable[[str], bool] = lambda name: True
-) -> dict[str, np.ndarray]:
+def read_npz(path: Path, is_wanted: Callable[[str], bool] = lambda name: True) -> dict[str, np.ndarray]:
     """Return the wanted arrays of an .npz, by name.
 
     Raises:
@@ -49,12 +48,12 @@ def read_npz(
     return arrays
 
 
-def read_npy(path: str | os.PathLike[str]) -> np.ndarray:
+def read_npy(path: Path) -> np.ndarray:
     """Return the array in an .npy of numbers.
 
     Raises:
       OSError: if the file cannot be opened.
-      ValueError: with the reason, if it is damaged or not numeric.
+      Exception: of any class, such as SyntaxError, if it is damaged or not numeric.
     """
     with open_regular(path) as file:
         return _read_array(file, "it", os.fstat(file.fileno()).st_size)

@@ -53,13 +53,12 @@ def room_of(num_bytes: int) -> int:
     return FREE_ROOM + LARGEST_RATIO * num_bytes
 
 
-def is_regular(path: str | os.PathLike[str]) -> bool:
+def is_regular(path: Path) -> bool:
     """Return whether a path is a regular file; False if it is missing or a folder.
 
     Raises:
       ValueError: naming the path, if a device, a pipe or a socket is there.
     """
-    path = Path(path)
     if path.exists() and not path.is_file() and not path.is_dir():
         raise ValueError(_refusal(path))
     return path.is_file()
@@ -70,7 +69,7 @@ def names_in(folder: Path) -> list[str]:
     return sorted(os.listdir(folder)) if folder.is_dir() else []
 
 
-def open_regular(path: str | os.PathLike[str], most_bytes: int = MOST_ARRAY_BYTES) -> BufferedReader:
+def open_regular(path: Path, most_bytes: int = MOST_ARRAY_BYTES) -> BufferedReader:
     """Open a regular file for reading bytes, of at most a given size.
 
     Raises:
@@ -95,7 +94,7 @@ def open_regular(path: str | os.PathLike[str], most_bytes: int = MOST_ARRAY_BYTE
     raise ValueError(reason)
 
 
-def read_regular(path: str | os.PathLike[str], most_bytes: int) -> bytes:
+def read_regular(path: Path, most_bytes: int) -> bytes:
     """Read the bytes of a regular file, up to its size when opened. Errors as in `open_regular`."""
     with open_regular(path, most_bytes) as file:
         # A file may grow beyond the bound while it is read.
@@ -108,26 +107,26 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _refusal(path: str | os.PathLike[str]) -> str:
+def _refusal(path: Path) -> str:
     return f"{path}: is not a regular file but a folder, device, pipe or socket; put a file there"
 
 
-def check_exists(path: str | os.PathLike[str], what: str) -> None:
+def check_exists(path: Path, what: str) -> None:
     """Raise FileNotFoundError, calling it `what`, unless there is a regular file."""
     if not is_regular(path):
-        raise FileNotFoundError(f"{os.fspath(path)}: no such {what}")
+        raise FileNotFoundError(f"{path}: no such {what}")
 
 
-def existing_bytes(path: str | os.PathLike[str], what: str) -> bytes:
+def existing_bytes(path: Path, what: str) -> bytes:
     """Return the bytes of a regular file. FileNotFoundError, calling it `what`: there is none."""
     check_exists(path, what)
     return read_regular(path, MOST_ARRAY_BYTES)
 
 
 @contextlib.contextmanager
-def reading(path: str | os.PathLike[str]) -> Iterator[None]:
+def reading(path: Path | str) -> Iterator[None]:
     """Turn errors about a file's content into one ValueError that names it."""
-    where = os.fspath(path)
+    where = str(path)
     try:
         yield
     except KeyError as error:

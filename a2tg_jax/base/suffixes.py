@@ -3,6 +3,7 @@
 import os
 from pathlib import Path
 
+from a2tg_jax.base.regular_files import expanded
 from a2tg_jax.base.text import shortened
 
 FUNCTIONS = {
@@ -12,13 +13,16 @@ FUNCTIONS = {
 """Names of public functions, without save_ and load_, by file suffix."""
 
 
-def check_suffix(path: str | os.PathLike[str], function: str) -> None:
-    """Raise ValueError if a file has the suffix of another format than the function's, such as "save_ply"."""
+def checked_path(path: str | os.PathLike[str], function: str) -> Path:
+    """Return a path of the user (`expanded`). ValueError: it has the suffix of another format than the function's, such
+    as "save_ply"."""
+    path = expanded(path)
     verb, _, format = function.partition("_")
-    format_of_suffix = FUNCTIONS.get(Path(path).suffix.lower(), format)
+    format_of_suffix = FUNCTIONS.get(path.suffix.lower(), format)
     if format_of_suffix != format:
         suffix = next(suffix for suffix, name in FUNCTIONS.items() if name == format)
         does = "writes" if verb == "save" else "reads"
         raise ValueError(
-            f"{shortened(os.fspath(path))}: {function} {does} *{suffix} files; call {verb}_{format_of_suffix} instead"
+            f"{shortened(str(path))}: {function} {does} *{suffix} files; call {verb}_{format_of_suffix} instead"
         )
+    return path

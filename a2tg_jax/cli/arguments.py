@@ -87,9 +87,13 @@ def parse(kind: type[Parsed], program: str, arguments: Sequence[str], default: P
     about = inspect.getdoc(kind) or ""
     given: dict[str, Any] = {} if default is None else {"default": default}
     command: Parsed = tyro.cli(kind, prog=program, args=arguments, description=about, registry=rules, **given)
+    values: list[Any] = []
+    for value in vars(command).values():
+        values += value if isinstance(value, tuple) else [value]
     for word in arguments:
-        # Raises ValueError for a URL, which would name a folder of this machine.
-        expanded(word.partition("=")[2] if word.startswith("--") else word)
+        text = word.partition("=")[2] if word.startswith("--") else word
+        if Path(text) in values:
+            expanded(text)  # Raises ValueError for a URL, which would name a folder of this machine.
     return command
 
 

@@ -1,7 +1,6 @@
 """The commands that make scene folders: `a2tg sfm` finds cameras, `a2tg download` fetches benchmark data sets."""
 
 import dataclasses
-import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -63,7 +62,7 @@ class Sfm:
         from a2tg_jax.data.load import is_scene
         from a2tg_jax.data.photo_folder import CAMERA_PICTURE
         from a2tg_jax.data.sfm import run_sfm
-        from a2tg_jax.results.commands import quick_flags, quicker_advice
+        from a2tg_jax.results.commands import first_training_command, quick_flags, quicker_advice
         from a2tg_jax.results.figures import save_camera_picture
 
         sources, out = self._places()
@@ -94,8 +93,7 @@ class Sfm:
             f"{summary.num_registered} of {summary.num_photos} photographs registered, {summary.num_points:,} points, "
             f"mean reprojection error {summary.mean_error:.2f} pixels"
         )
-        run = ["a2tg", "train", str(out), "--out", f"runs/{out.resolve().name}"]
-        command = f"{shlex.join(run)} {quick_flags(summary.longest_side)}"
+        command = first_training_command(out, quick_flags(summary.longest_side))
         if summary.num_registered <= LEAST_PLACED * summary.num_photos:
             raise ValueError(
                 f"only {summary.num_registered} of {summary.num_photos} photographs have a camera, so that {out} shows "

@@ -100,7 +100,7 @@ class Train:
         from a2tg_jax.results.forecast import room_for_photographs
         from a2tg_jax.results.history import tensorboard_library
         from a2tg_jax.results.run_processes import check_batch_sizes, follow_first_process
-        from a2tg_jax.results.run_training import RunOptions, begin_run, unseen, warn
+        from a2tg_jax.results.run_training import RunOptions, begin_run, unseen, warn_of_doubts
 
         if self.finish_now and not self.resume:
             raise ValueError("--finish-now shortens a training that was stopped: add --resume")
@@ -129,7 +129,7 @@ class Train:
                 progress=not self.quiet,
                 watched=training.in_browser if self.view else unseen,
                 on_note=print_now,
-                confirm=warn if self.yes else training.ask,
+                confirm=warn_of_doubts if self.yes else training.ask,
                 session=session,
             )
             if self.resume:

@@ -15,7 +15,7 @@ from a2tg_jax.data.load import SceneSource
 from a2tg_jax.results.folder import RunFolder, opened
 from a2tg_jax.results.record import RunRecord
 from a2tg_jax.results.report import RunResult, sizes_line, summary_text
-from a2tg_jax.results.run_training import RunOptions, begin_run, resume_run, warn
+from a2tg_jax.results.run_training import RunOptions, begin_run, resume_run, warn_of_doubts
 from a2tg_jax.results.viewing import LiveView, shown_live
 
 DEMO_SYSTEM = A2tg(
@@ -61,7 +61,7 @@ def ask(doubts: Sequence[str]) -> None:
     not yes."""
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
         raise ValueError(f"{'; '.join(doubts)}; to train all the same, add `yes`")
-    warn(doubts)
+    warn_of_doubts(doubts)
     print("Train all the same? [y/N] ", end="", file=sys.stderr, flush=True)
     if sys.stdin.readline().strip().lower() not in ("y", "yes"):
         raise ValueError("nothing was trained, as you answered")

@@ -140,10 +140,9 @@ def check_gaussians(gaussians: Gaussians, name: str = "gaussians") -> None:
     bases = gaussians.sh.shape[1]
     if bases not in NUM_BASES:
         raise ValueError(f"{name}.sh must be [{num}, K, 3] with K = 1, 4, 9 or 16, for degrees 0 to 3; got K = {bases}")
-    shapes = {"quats": (num, 4), "log_scales": (num, 2), "logit_opacities": (num,), "sh": (num, bases, 3)}
+    shapes = {"quats": (num, 4), "log_scales": (num, 2), "logit_opacities": (num,)}
     for field, shape in shapes.items():
-        value = getattr(gaussians, field)
-        check_floats(f"{name}.{field}", value, shape)
+        check_floats(f"{name}.{field}", getattr(gaussians, field), shape)
     dtypes = {field: str(dtype_of(getattr(gaussians, field))) for field in names}
     # The error names the field that differs from most, whichever comes first.
     usual = max(dtypes.values(), key=[*dtypes.values()].count)

@@ -63,7 +63,7 @@ def sh_sum(sh: Array, means: Array, center: Array, degree: ArrayLike) -> Array:
     """
     num = sh.shape[1]
     basis = sh_basis(directions_from(center, means), num)
-    degrees = np.asarray([0, 1, 1, 1, 2, 2, 2, 2, 2, 3, 3, 3, 3, 3, 3, 3], np.int32)[:num]
+    degrees = np.repeat(np.arange(4, dtype=np.int32), [1, 3, 5, 7])[:num]
     # A mask, not a slice: the degree may be traced.
     basis = jnp.where((degrees <= jnp.asarray(degree, jnp.int32))[None, :], basis, 0.0)
     # A sum, which CPUs do several times faster than many small matrix products.

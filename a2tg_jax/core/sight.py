@@ -31,8 +31,10 @@ class Sight(NamedTuple):
         if rays is None:
             height, width = size
             return Sight(viewmat, K, np.zeros(2), np.array([width, height], np.float64))
-        # NaN: pixels without a ray.
-        return Sight(viewmat, K, np.nanmin(rays, axis=(0, 1)), np.nanmax(rays, axis=(0, 1)))
+        places = np.asarray(rays).reshape(-1, 2)
+        places = places[np.isfinite(places).all(axis=1)]
+        # Without any ray, the rectangle is inverted and contains nothing.
+        return Sight(viewmat, K, places.min(axis=0, initial=np.inf), places.max(axis=0, initial=-np.inf))
 
     @staticmethod
     def of_camera(camera: Camera) -> "Sight":
@@ -40,17 +42,18 @@ class Sight(NamedTuple):
         viewmat = np.asarray(camera.viewmat, np.float64)
         return Sight.of(viewmat, np.asarray(camera.K, np.float64), (camera.height, camera.width), camera.rays)
 
-    def depths_seen(self, points: np.ndarray, near_plane: float = NEAR_PLANE) -> np.ndarray:
-        """Return the depths [S] of the points, among [P, 3], that are in the picture and beyond the near plane."""
+    def seen(self, points: np.ndarray, near_plane: float = NEAR_PLANE) -> tuple[np.ndarray, np.ndarray]:
+        """Return which of the points [P, 3] are in the picture and beyond the near plane, [P] bool, and all depths
+        [P]."""
         in_frame = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
-        in_front = in_frame[in_frame[:, 2] > near_plane]
-        places = pinhole_pixels(in_front, self.K)
-        is_seen = ((places >= self.low) & (places <= self.high)).all(axis=1)
-        return np.asarray(in_front[is_seen, 2])
+        is_seen = in_frame[:, 2] > near_plane
+        places = pinhole_pixels(in_frame[is_seen], self.K)
+        is_seen[is_seen] = ((places >= self.low) & (places <= self.high)).all(axis=1)
+        return is_seen, in_frame[:, 2]
 
     def num_seen(self, points: np.ndarray, near_plane: float = NEAR_PLANE) -> int:
         """Return the number of points [P, 3] in the picture and beyond the near plane."""
-        return len(self.depths_seen(points, near_plane))
+        return int(self.seen(points, near_plane)[0].sum())
 
 
 def unseeing(points: np.ndarray, sights: Sequence[Sight]) -> list[int]:

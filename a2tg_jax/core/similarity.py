@@ -5,6 +5,7 @@ fitted to the basis itself at fixed directions, so that it agrees with the rende
 """
 
 import dataclasses
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ from a2tg_jax.base.even_spacing import fibonacci
 from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.core.cameras import MAX_SKEW
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
-from a2tg_jax.core.sh import sh_basis
+from a2tg_jax.core.sh import NUM_BASES, sh_basis
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -81,7 +82,6 @@ def check_similarity(similarity: Similarity, what: str) -> None:
 
 
 NUM_DIRECTIONS = 64
-SH_DEGREES = (slice(0, 1), slice(1, 4), slice(4, 9), slice(9, 16))
 
 
 def transform_gaussians(gaussians: Gaussians, similarity: Similarity) -> Gaussians:
@@ -134,8 +134,8 @@ def sh_rotation(rotation: np.ndarray) -> np.ndarray:
     before = _basis(directions)
     after = _basis(directions @ rotation.T)
     matrix = np.zeros((16, 16))
-    for degree in SH_DEGREES:
-        matrix[degree, degree] = np.linalg.lstsq(after[:, degree], before[:, degree], rcond=None)[0]
+    for first, end in itertools.pairwise((0, *NUM_BASES)):
+        matrix[first:end, first:end] = np.linalg.lstsq(after[:, first:end], before[:, first:end], rcond=None)[0]
     return matrix
 
 

@@ -20,6 +20,7 @@ from jax.typing import ArrayLike, DTypeLike
 
 from a2tg_jax.base.checks import check_array, check_floats, check_kind, check_mask, check_shape, plain_array, short_repr
 from a2tg_jax.base.named_fields import NamedFields
+from a2tg_jax.core.numerics import where_rows
 from a2tg_jax.core.pytree import is_shared, partition, pytree, static
 
 T = TypeVar("T")
@@ -158,7 +159,7 @@ class Table(NamedFields):
 
     def flat(self) -> np.ndarray:
         """Return the elements [M, C] of all blocks, block after block, each row by row (host)."""
-        elements = np.zeros((self.count_elements(self.num), len(self.padding)), self._dtype)
+        elements = np.zeros((self.count_elements(self.num), len(self.padding)), self.dtype)
         for _, blocks, rows in self._flat_groups():
             elements[rows] = blocks.reshape(*rows.shape, len(self.padding))
         return elements
@@ -197,7 +198,8 @@ class Table(NamedFields):
         return Layout(self.bucket_sizes, tuple(map(len, self.buckets)))
 
     @property
-    def _dtype(self) -> DTypeLike:
+    def dtype(self) -> DTypeLike:
+        """Dtype of the blocks."""
         return self.buckets[0].dtype if self.buckets else np.float32
 
     def count_elements(self, num: int) -> int:
@@ -234,7 +236,7 @@ class Table(NamedFields):
             # Gaussians of other buckets point beyond the end, where they are dropped.
             rows = jnp.where(self.bucket == index, self.row, bucket.shape[0])
             marks = jnp.zeros(bucket.shape[0], bool).at[rows].set(is_cleared, mode="drop")
-            cleared.append(jnp.where(marks.reshape(-1, *[1] * (bucket.ndim - 1)), jnp.zeros_like(bucket), bucket))
+            cleared.append(where_rows(marks, jnp.zeros_like(bucket), bucket))
         return dataclasses.replace(self, buckets=tuple(cleared))
 
     def take(self, rows: np.ndarray, padding: Sequence[float] | None = None) -> Self:
@@ -392,7 +394,7 @@ def resize(
 def _rebuilt(old: TableT, sources: _Indices, ids: np.ndarray, places: Places, padding: Sequence[float]) -> TableT:
     """Return a table in which the Gaussians `ids` [n] have the old table's blocks at (bucket, row) [n], resized; other
     Gaussians have padding."""
-    buckets = _filled(places.layout, padding, old._dtype)
+    buckets = _filled(places.layout, padding, old.dtype)
     old_bucket, old_row = sources
     new_bucket = np.asarray(places.bucket)[ids]
     new_row = np.asarray(places.row)[ids]

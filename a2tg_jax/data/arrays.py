@@ -1,6 +1,5 @@
 """Scenes from arrays: images and cameras that are already in memory."""
 
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
@@ -10,6 +9,7 @@ from numpy.typing import ArrayLike
 from a2tg_jax import DepthMap, Mask, Picture, Scene
 from a2tg_jax.base.checks import check_kind, check_shape, check_unmasked, described, kind_of
 from a2tg_jax.base.even_spacing import evenly_chosen
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.core.cameras import check_intrinsics
 from a2tg_jax.core.pictures import how_to_convert
 from a2tg_jax.data.assembly import (
@@ -129,7 +129,7 @@ def scene_from_arrays(
             depth = _converted(f"depths[{index}]", DepthMap.of, depths[index], picture.size)
         shots.append(Shot(view_name, viewmat, Ks[index], picture, mask, depth=depth))
     for message in _mistakes(images, colors, shots, None if cloud is None else cloud.points):
-        warnings.warn(f"the scene {name}: {message}", stacklevel=2)
+        warn(f"the scene {name}: {message}")
     scene = assemble_scene(name, *every_kth(shots, test_every), cloud, source=f"the scene {name}")
     # Those of the shots are made orthonormal.
     warn_of_rounding("viewmats", viewmats[:, :3, 3], scene.transform, f"the scene {name}")

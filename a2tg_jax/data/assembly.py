@@ -5,7 +5,6 @@ Every scene gets the same origin, orientation and size before training. All of i
 
 import dataclasses
 import itertools
-import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -17,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from a2tg_jax import Camera, DepthMap, Mask, Picture, Scene, Similarity, View
 from a2tg_jax.base.even_spacing import evenly_chosen
 from a2tg_jax.base.text import counted, first_names, in_bytes
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.core.cameras import LARGEST_COORDINATE, MAX_SKEW, check_calibration
 from a2tg_jax.core.sight import FIRST_LOOK, Sight, unseeing
 from a2tg_jax.data.capture_geometry import (
@@ -135,7 +135,7 @@ def assemble_scene(
         obstacle = _obstacle(looks) if start.is_random else ""
         if cloud is not None or obstacle or not is_object:
             kind = f"random points, since {obstacle}" if obstacle else "points where photographs agree"
-            warnings.warn(f"{source}: {lacks} sparse points; starts from {len(start.points):,} {kind}", stacklevel=3)
+            warn(f"{source}: {lacks} sparse points; starts from {len(start.points):,} {kind}")
     views = [_view(shot, viewmats[shot.name]) for shot in shots]
     test_names = {shot.name for shot in test}
     return Scene(
@@ -232,19 +232,18 @@ def _warn_of_outlying(shots: Sequence[Shot], poses: np.ndarray, cloud: PointClou
         if cloud is not None:
             points = evenly_chosen(cloud.points[are_somewhere(cloud.points)], FIRST_LOOK)
             for index in indices.tolist():
-                seen = shots[index].sight(poses[index]).depths_seen(points, 0.0)
-                if len(seen):
-                    depths.append(np.median(seen))
+                is_seen, of_points = shots[index].sight(poses[index]).seen(points, 0.0)
+                if is_seen.any():
+                    depths.append(np.median(of_points[is_seen]))
         return float(np.median(depths)) if depths else distance_to_subject(poses[indices])
 
     is_outlying = outlying_cameras(poses, distance_of)
     if is_outlying.any():
         names = [shots[index].name for index in np.flatnonzero(is_outlying).tolist()]
-        warnings.warn(
+        warn(
             f"{source}: {counted(len(names), 'camera')} of {len(shots)} far from all others: {first_names(names)}. "
             "The others alone decide the world's origin and unit. If these poses are wrong, remove the photographs or "
-            "correct the poses",
-            stacklevel=4,
+            "correct the poses"
         )
     return is_outlying
 
@@ -263,11 +262,10 @@ def warn_of_rounding(what: str, positions: np.ndarray, transform: Similarity, so
     is_whole = np.abs(coarse - np.rint(coarse)) <= 1e-3  # Such as a grid in metres, which lost nothing.
     if not len(coarse) or not is_float32.all() or (is_whole.all() and steps.max() < 1):
         return
-    warnings.warn(
+    warn(
         f"{source}: {what} were rounded to float32, in steps of {steps.max():g}, which is "
         f"{steps.max() * transform.scale:.2g} of the cameras' distance from the subject: give them in float64, or "
-        "subtract an offset before they become float32",
-        stacklevel=4,
+        "subtract an offset before they become float32"
     )
 
 
@@ -321,7 +319,7 @@ def _usable_points(cloud: PointCloud, transform: Similarity, source: str) -> Poi
     if not is_usable.all():
         left_out = counted(int(np.count_nonzero(~is_usable)), "point")
         message = f"{source}: {left_out} left out, not finite or beyond ±{LARGEST_COORDINATE:g}"
-        warnings.warn(message, stacklevel=4)
+        warn(message)
     points = cloud.points[is_usable]
     warn_of_rounding("points", points, transform, source)
     return PointCloud(transform.apply(points), cloud.colors[is_usable])
@@ -338,7 +336,7 @@ def _seen_points(cloud: PointCloud, train: Sequence[Shot], sights: Sequence[Sigh
         return None
     if blind:
         message = f"{source}: {len(blind)} of {len(sights)} training views see none of its points, such as "
-        warnings.warn(f"{message}{train[blind[0]].name}: nothing to start from there", stacklevel=4)
+        warn(f"{message}{train[blind[0]].name}: nothing to start from there")
     return cloud
 
 
@@ -492,10 +490,9 @@ def warn_of_lenses(scene: Scene) -> None:
     views = [view for view in (*scene.train, *scene.test) if view.camera.rays is not None]
     num = len(rays_of_lenses(views))
     if num > MANY_LENSES and 2 * num > len(views):
-        warnings.warn(
+        warn(
             f"{scene.name}: {len(views)} photographs have {num} lenses, whose rays take {in_bytes(ray_bytes(views))}: "
-            'calibrate photographs of one camera together, or undistort them (lens="undistort")',
-            stacklevel=3,
+            'calibrate photographs of one camera together, or undistort them (lens="undistort")'
         )
 
 

@@ -51,7 +51,7 @@ def turntable(cameras: Sequence[Camera], num_frames: int, up: ArrayLike | None =
         raise ValueError("an orbit needs a camera; got none")
     viewmats = matrices_of(cameras)
     if np.isnan(distance_to_subject(viewmats)):
-        raise ValueError("cameras must look at one subject to orbit, and these do not: use smooth_path")
+        raise ValueError("cameras must look at one subject to orbit, and these do not: take smooth_path, `path` smooth")
     subject = subject_of(viewmats)
     up = Origin.of_cameras(cameras).vertical if up is None else np.asarray(up)
     if up.shape != (3,) or not abs(np.linalg.norm(up) - 1) < MAX_SKEW:

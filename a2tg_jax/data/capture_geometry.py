@@ -113,7 +113,9 @@ def perpendicular(direction: np.ndarray) -> np.ndarray:
 
 def largest_gap(viewmats: np.ndarray, up: np.ndarray) -> float:
     """Return the largest angle in radians, at the subject and about the vertical `up` [3], without a camera [V, 4, 4];
-    2π with one camera."""
+    2π with one camera, or if they do not look at one subject, such as from the middle of a room."""
+    if np.isnan(distance_to_subject(viewmats)):
+        return 2 * np.pi
     offsets = camera_centers(viewmats) - subject_of(viewmats)
     side = perpendicular(up)
     angles = np.sort(np.arctan2(offsets @ np.cross(up, side), offsets @ side))

@@ -1,7 +1,6 @@
 """COLMAP scenes: a sparse model (.bin or .txt) next to a folder of images."""
 
 import re
-import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
@@ -13,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from a2tg_jax import Scene, Similarity
 from a2tg_jax.base.regular_files import is_regular, names_in
 from a2tg_jax.base.text import counted
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.data.assembly import PointCloud, assemble_scene, every_kth, rigid_viewmat, scene_name
 from a2tg_jax.data.capture_geometry import camera_centers
 from a2tg_jax.data.colmap_cameras import ColmapCamera
@@ -84,10 +84,9 @@ def _model_of(path: Path) -> Path:
         return f"{'its own' if place == '.' else place} ({counted(counts[model], 'image')})"
 
     others = [model for model in models if model != chosen]
-    warnings.warn(
+    warn(
         f"{path}: has {len(models)} COLMAP models; {described(chosen)} is read, and not "
-        f"{', '.join(map(described, others))}; to read another, give its folder, such as {others[0]}",
-        stacklevel=3,
+        f"{', '.join(map(described, others))}; to read another, give its folder, such as {others[0]}"
     )
     return chosen
 
@@ -160,7 +159,7 @@ def points_in_world_of(path: Path, viewmats: Mapping[str, np.ndarray]) -> PointC
         to_world = _between(np.stack([poses[name] for name in shared]), np.stack([others[name] for name in shared]))
     if to_world is None:
         message = f"{model}: has other photographs or poses than the scene: its points are not used"
-        warnings.warn(message, stacklevel=3)
+        warn(message)
         return None
     cloud = _start_cloud(model, contents)
     return PointCloud(to_world.apply(cloud.points), cloud.colors)
@@ -246,10 +245,9 @@ def _read_model(model: Path) -> SparseModel:
     text = on_disk(model, "images.txt") if files["images"].suffix.lower() == ".bin" else None
     num_in_text = len(images) if text is None else num_images(text)
     if num_in_text != len(images):
-        warnings.warn(
+        warn(
             f"{model}: is read from its .bin files, with {counted(len(images), 'image')}, and not from its "
-            f".txt files, with {num_in_text}; to read those, move the .bin files away",
-            stacklevel=3,
+            f".txt files, with {num_in_text}; to read those, move the .bin files away"
         )
     for image in images:
         if image.camera_id not in cameras:

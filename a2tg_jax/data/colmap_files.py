@@ -16,7 +16,6 @@ import mmap
 import os
 import re
 import struct
-import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -25,6 +24,7 @@ import numpy as np
 
 from a2tg_jax.base.regular_files import open_regular
 from a2tg_jax.base.text import shortened
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.data.colmap_cameras import BY_NAME, MODELS, ColmapCamera
 
 KINDS = ("cameras", "images", "points3D")
@@ -240,7 +240,7 @@ def _read_text(file: BinaryIO, path: Path, kind: str) -> Any:
             ) from None
     if announced not in (None, len(records)):
         message = f"{path}: says that it has {announced} {kind}, and has {len(records)}: if it is cut off, export it"
-        warnings.warn(f"{message} again", stacklevel=3)
+        warn(f"{message} again")
     return np.array(records, POINT) if kind == "points3D" else records
 
 

@@ -51,7 +51,7 @@ class PictureError(ValueError):
         return f"{path}: {text}"
 
 
-def read_pixels(path: str | os.PathLike[str]) -> np.ndarray:
+def read_pixels(path: Path) -> np.ndarray:
     """Return the pixels of an image file as stored, without EXIF rotation, because cameras are estimated without it.
 
     Greyscale and palette images become RGB; an alpha channel is kept unless it is opaque throughout.
@@ -71,7 +71,7 @@ def read_pixels(path: str | os.PathLike[str]) -> np.ndarray:
     return pixels
 
 
-def picture_size(path: str | os.PathLike[str]) -> tuple[int, int]:
+def picture_size(path: Path) -> tuple[int, int]:
     """Return (width, height) of an image file as stored, without decoding it, so `MAX_PIXELS` does not apply."""
     with _opened(path, is_decoded=False) as image:
         return _stored_size(image)
@@ -102,7 +102,7 @@ class PictureFacts(NamedTuple):
     """Whether its XMP (GPano) says that it is a whole equirectangular panorama; None: it has none."""
 
 
-def picture_facts(path: str | os.PathLike[str]) -> PictureFacts:
+def picture_facts(path: Path) -> PictureFacts:
     """Return facts of an image file after decoding it. Raises as `read_pixels` does."""
     with _opened(path) as image:
         turn = image.getexif().get(ExifTags.Base.Orientation, 1)  # Decoding TIFF removes it.
@@ -136,7 +136,7 @@ def _has_alpha(image: Image.Image) -> bool:
     return "A" in image.getbands() or "transparency" in image.info
 
 
-def save_upright(path: str | os.PathLike[str], target: Path, quality: int) -> None:
+def save_upright(path: Path, target: Path, quality: int) -> None:
     """Write an image file again with its pixels turned as EXIF says, as PNG or JPEG by the target's suffix.
 
     A PNG keeps the alpha channel. EXIF data of the camera are kept, because the focal length is among them. Data of a
@@ -159,21 +159,21 @@ def save_upright(path: str | os.PathLike[str], target: Path, quality: int) -> No
             upright.convert("RGB").save(target, quality=quality, subsampling=0, exif=exif)  # 4:4:4 keeps colours sharp.
 
 
-def software_of(path: str | os.PathLike[str]) -> str:
+def software_of(path: Path) -> str:
     """Return the name of the program that wrote an image file; "" if the file does not say. Raises as `read_pixels`."""
     with _opened(path, is_decoded=False) as image:
         # PNG has it as a text, other formats in EXIF.
         return str(image.info.get("Software") or image.getexif().get(ExifTags.Base.Software) or "")
 
 
-def upright_thumbnail(path: str | os.PathLike[str], side: int) -> tuple[tuple[int, int], np.ndarray]:
+def upright_thumbnail(path: Path, side: int) -> tuple[tuple[int, int], np.ndarray]:
     """Return (width, height) and grey levels [side, side] of an image file turned as EXIF says."""
     with _opened(path) as image:
         upright = ImageOps.exif_transpose(image)
         return upright.size, np.asarray(upright.convert("RGB").convert("L").resize((side, side))).astype(np.float32)
 
 
-def read_grey(path: str | os.PathLike[str]) -> tuple[np.ndarray, int]:
+def read_grey(path: Path) -> tuple[np.ndarray, int]:
     """Return the levels [H, W] int32 of a greyscale image of 8 or 16 bits, such as a depth map, and the largest level.
 
     Raises as `read_pixels` does, and for colours.
@@ -187,7 +187,7 @@ def read_grey(path: str | os.PathLike[str]) -> tuple[np.ndarray, int]:
 
 
 @contextmanager
-def _opened(path: str | os.PathLike[str], most_bits: int = 8, is_decoded: bool = True) -> Iterator[Image.Image]:
+def _opened(path: Path, most_bits: int = 8, is_decoded: bool = True) -> Iterator[Image.Image]:
     """Open an image within the block; its size and bits are checked if it is decoded.
 
     Every decoding error, in the block too, becomes a PictureError.
@@ -216,7 +216,7 @@ def _opened(path: str | os.PathLike[str], most_bits: int = 8, is_decoded: bool =
         raise PictureError(path, f"cannot be read as an image ({reason}); replace or remove it") from error
 
 
-def _formats_of(path: str | os.PathLike[str], file: BufferedReader) -> tuple[str, ...]:
+def _formats_of(path: Path, file: BufferedReader) -> tuple[str, ...]:
     # HEIC and AVIF files begin with a box "ftyp": its length, its name, and the brands, each of 4 bytes.
     head = file.peek(LONGEST_BOX)[:LONGEST_BOX]
     brands = {head[at : at + 4] for at in range(8, min(len(head), int.from_bytes(head[:4], "big")), 4)}

@@ -2,7 +2,6 @@
 
 import os
 import unicodedata
-import warnings
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePath, PureWindowsPath
@@ -10,6 +9,7 @@ from typing import TypeVar
 
 from a2tg_jax.base.regular_files import is_regular, names_in
 from a2tg_jax.base.text import counted, first_names, shortened
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.data.decoding import PictureError
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".avif")
@@ -127,7 +127,7 @@ def warn_of_unposed(folder: Path, names: Iterable[str], is_deep: bool = True) ->
     others.sort()
     if others:
         left_out = f"{counted(len(others), 'photograph')} without a pose, such as {shortened(others[0])}"
-        warnings.warn(f"{folder}: {left_out}: not used", stacklevel=3)
+        warn(f"{folder}: {left_out}: not used")
 
 
 def map_in_threads(function: Callable[..., Result], *iterables: Iterable[object]) -> list[Result]:

@@ -60,7 +60,7 @@ class SceneSource(SceneOptions):
         if self.is_built_in:
             return self.path
         path = Path(self.path)
-        is_file = path.suffix in (".json", ".xml")
+        is_file = path.suffix.lower() in (".json", ".xml")
         return scene_name(path.parent if is_file else path)
 
     def load(self, room: int | None = None) -> Scene:

@@ -5,7 +5,6 @@ named by number, next to metadata with all poses.
 """
 
 import functools
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from a2tg_jax.base.json_text import MOST_BYTES, lenient_number, number_rows, read_object
 from a2tg_jax.base.regular_files import is_regular, read_regular
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.data.assembly import PointCloud
 from a2tg_jax.data.decoding import picture_size, read_grey, read_pixels
 from a2tg_jax.data.image_files import find_image, is_photo, map_in_threads
@@ -173,7 +173,7 @@ def _record3d_frames(file: Path) -> Frames:
     unposed = [image.name for number, image in images.items() if number >= len(poses)]
     if unposed:
         message = f"{file}: {len(unposed)} of {len(images)} images have no pose, such as {unposed[0]}: not used"
-        warnings.warn(message, stacklevel=2)
+        warn(message)
     return Frames(file, frames)
 
 

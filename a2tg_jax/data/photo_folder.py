@@ -8,7 +8,6 @@ import contextlib
 import itertools
 import math
 import re
-import warnings
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
@@ -18,6 +17,7 @@ import numpy as np
 
 from a2tg_jax.base.regular_files import is_regular, names_in, read_regular
 from a2tg_jax.base.text import PROGRAM, counted, first_names
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.data.decoding import software_of, upright_thumbnail
 from a2tg_jax.data.image_files import PHOTO_SUFFIXES, files_below, is_hidden, is_photo, map_in_threads
 from a2tg_jax.data.other_runs import other_run
@@ -116,7 +116,7 @@ def find_photos(folder: Path, least: int = LEAST_PHOTOS, chosen: Sequence[Path] 
 
     Raises:
       FileNotFoundError: if there is no such folder.
-      ValueError: if it is a file, or holds fewer than `least` photographs.
+      ValueError: if it holds fewer than `least` photographs, or a chosen file is another program's.
     """
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder of photographs, photograph or video")
@@ -148,10 +148,10 @@ def find_photos(folder: Path, least: int = LEAST_PHOTOS, chosen: Sequence[Path] 
             sentences.append(_skipped(folder, unread))
         raise ValueError(". ".join(sentences))
     if left_out:
-        warnings.warn(f"{folder}: {_about_left_out(left_out)}", stacklevel=3)
+        warn(f"{folder}: {_about_left_out(left_out)}")
     foreign = [file for file in unread if file.suffix.lower() in FOREIGN_SUFFIXES + VIDEO_SUFFIXES + SPHERICAL_SUFFIXES]
     if foreign:
-        warnings.warn(f"{folder}: {_skipped(folder, foreign)}", stacklevel=3)
+        warn(f"{folder}: {_skipped(folder, foreign)}")
     return photos
 
 

@@ -13,8 +13,6 @@ Next to the folder `images` may be
 import contextlib
 import dataclasses
 import functools
-import os
-import warnings
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -28,6 +26,7 @@ from a2tg_jax import DepthMap, Mask
 from a2tg_jax.base.checks import check_literal
 from a2tg_jax.base.npz import read_npy
 from a2tg_jax.base.text import shortened
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.data.assembly import Shot, check_test_every
 from a2tg_jax.data.decoding import MAX_PIXELS, picture_size, read_grey, read_pixels
 from a2tg_jax.data.image_files import find_image, map_in_threads, on_disk
@@ -160,10 +159,9 @@ def read_photos(
     if not masks:
         _warn_of_unused_masks(photos)
         if options.mask_as == "background":
-            warnings.warn(
+            warn(
                 f"{place}: no photograph has a mask, so that `mask_as` background changes nothing; masks are read "
-                f"from the folder {MASKS} next to images, or from the mask_path of a frame of transforms.json",
-                stacklevel=3,
+                f"from the folder {MASKS} next to images, or from the mask_path of a frame of transforms.json"
             )
     else:
         warn_of_lacking_masks(place, lacking, len(files))
@@ -176,28 +174,27 @@ def _warn_of_unused_masks(photos: Sequence[Photo]) -> None:
     folders = {photo.below_images[0].with_name(MASKS) for photo in photos if photo.below_images}
     for folder in filter(Path.is_dir, folders):
         message = f"{folder}: holds no mask of a photograph of the scene, called NAME.jpg.png or NAME.png: not used"
-        warnings.warn(message, stacklevel=4)
+        warn(message)
     for root in {folder.parent for folder in folders}:
         for folder in sorted(root.glob("*[mM]ask*/")):
             if not folder.name.startswith(MASKS):
-                warnings.warn(f"{folder}: not read; if it holds masks, rename it to {MASKS}", stacklevel=4)
+                warn(f"{folder}: not read; if it holds masks, rename it to {MASKS}")
 
 
 def warn_of_lacking_masks(place: Path, lacking: Sequence[str], num: int) -> None:
     """Warn of the photographs, among `num`, that have no mask although others have."""
     if lacking:
         message = f"{place}: {len(lacking)} of {num} photographs have no mask, such as {lacking[0]}"
-        warnings.warn(f"{message}: all of their pixels count", stacklevel=4)
+        warn(f"{message}: all of their pixels count")
 
 
 def warn_of_grey(grey: Sequence[Path], masks: Sequence[Path]) -> None:
     """Warn of masks with areas that are neither black nor white, among all masks."""
     if grey:
-        warnings.warn(
+        warn(
             f"{grey[0].parent}: {len(grey)} of {len(masks)} masks have areas that are neither black nor white, such as "
             f"{grey[0].name}: pixels above an eighth of the largest level count; make a mask black where pixels must "
-            "not count, and white elsewhere",
-            stacklevel=4,
+            "not count, and white elsewhere"
         )
 
 
@@ -344,10 +341,9 @@ def _find_copies(files: Sequence[tuple[Path, str]], downscale: int, root: Path) 
         compare = functools.partial(_difference_of_copy, folder, smaller, downscale)
         unlike = [difference for difference in map_in_threads(compare, of_folder) if difference]
         if unlike:
-            warnings.warn(
+            warn(
                 f"{smaller}: does not hold the files of {folder} at 1/{downscale} of their size, for {len(unlike)} of "
-                f"{len(of_folder)}, such as {unlike[0]}: not used",
-                stacklevel=4,
+                f"{len(of_folder)}, such as {unlike[0]}: not used"
             )
         else:
             copies[folder] = smaller
@@ -473,7 +469,7 @@ def _depth_map(file: Path, lens: Lens, stored: tuple[int, int], size: tuple[int,
     return DepthMap((size[1], size[0]), load)
 
 
-def read_depths(file: str | os.PathLike[str]) -> np.ndarray:
+def read_depths(file: Path) -> np.ndarray:
     """Return the numbers [H, W] float32 of a depth map, an .npy or a greyscale PNG, whose largest value is 1."""
     if Path(file).suffix.lower() == ".npy":
         try:

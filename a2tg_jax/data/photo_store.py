@@ -1,6 +1,7 @@
 """Store of the photographs of a scene: in memory while there is room, otherwise read on demand from a disk."""
 
 import dataclasses
+import functools
 import tempfile
 import threading
 import weakref
@@ -54,7 +55,8 @@ class Shelf:
         # docs/reliability.md, "Photographs beyond the memory"
         checksum = checksum_of(pixels)
         if source is not None:
-            return _FilePicture(pixels.shape, _FileRead(source, checksum), checksum=checksum)
+            read_again = functools.partial(_read_unchanged, source, checksum)
+            return _FilePicture(pixels.shape, read_again, checksum=checksum)
         folder = cache_folder()
         shape = pixels.shape
         try:
@@ -83,18 +85,12 @@ class Shelf:
         return Picture(shape, read, checksum=checksum)
 
 
-@dataclasses.dataclass(frozen=True)
-class _FileRead:
-    """Function that reads the pixels of an image file, which must not change."""
-
-    source: Path
-    checksum: int
-
-    def __call__(self) -> np.ndarray:
-        pixels = np.ascontiguousarray(read_pixels(self.source))
-        if checksum_of(pixels) != self.checksum:
-            raise ValueError(f"{self.source}: has changed since the scene was loaded; restore it or start again")
-        return pixels
+def _read_unchanged(source: Path, checksum: int) -> np.ndarray:
+    """Return the pixels of an image file. ValueError: they have changed."""
+    pixels = np.ascontiguousarray(read_pixels(source))
+    if checksum_of(pixels) != checksum:
+        raise ValueError(f"{source}: has changed since the scene was loaded; restore it or start again")
+    return pixels
 
 
 class _FilePicture(Picture):

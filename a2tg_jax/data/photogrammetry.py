@@ -8,7 +8,6 @@ each photograph.
 
 import functools
 import re
-import warnings
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ import numpy as np
 from a2tg_jax.base.json_text import MOST_BRACKETS, MOST_BYTES
 from a2tg_jax.base.regular_files import is_regular, names_in, open_regular, read_regular
 from a2tg_jax.base.text import shortened
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.data.assembly import rigid_motion
 from a2tg_jax.data.decoding import picture_size
 from a2tg_jax.data.image_files import files_below, find_image, is_photo, warn_of_unposed
@@ -129,16 +129,14 @@ def _posed_cameras(file: Path) -> list[tuple[str, Element, np.ndarray]]:
             posed.append((label, sensor, pose))
     num = len(posed) + len(unused)
     if in_rigs:
-        warnings.warn(
+        warn(
             f"{file}: {len(in_rigs)} of {num} cameras have no own pose, such as {shortened(in_rigs[0])}: placed by "
-            "their sensors' offsets from the master, in units of its pose",
-            stacklevel=3,
+            "their sensors' offsets from the master, in units of its pose"
         )
     if unused:
-        warnings.warn(
+        warn(
             f"{file}: {len(unused)} of {num} cameras have no pose or are switched off, such as "
-            f"{shortened(unused[0])}: not used",
-            stacklevel=3,
+            f"{shortened(unused[0])}: not used"
         )
     return posed
 
@@ -317,7 +315,7 @@ def _with_points(file: Path, frames: list[dict[str, Any]]) -> Frames:
     files = sorted(file.parent.glob("*.ply"))
     if len(files) > 1:
         names = ", ".join(each.name for each in files)
-        warnings.warn(f"{file}: {len(files)} PLY files are beside it, {shortened(names)}: none used", stacklevel=3)
+        warn(f"{file}: {len(files)} PLY files are beside it, {shortened(names)}: none used")
     if len(files) != 1:
         return Frames(file, frames)
     cloud = read_ply_points(files[0])
@@ -326,10 +324,7 @@ def _with_points(file: Path, frames: list[dict[str, Any]]) -> Frames:
     farthest = FARTHEST_POINTS * np.linalg.norm(centers - middle, axis=1).max()
     points = cloud.points[np.isfinite(cloud.points).all(axis=-1)]
     if len(points) and farthest and not np.linalg.norm(np.median(points, axis=0) - middle) <= farthest:
-        warnings.warn(
-            f"{file}: the points beside it are far from its cameras, in another coordinate system: not used",
-            stacklevel=3,
-        )
+        warn(f"{file}: the points beside it are far from its cameras, in another coordinate system: not used")
         return Frames(file, frames)
     return Frames(file, frames, cloud)
 

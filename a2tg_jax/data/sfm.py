@@ -6,7 +6,6 @@ import os
 import re
 import shutil
 import tempfile
-import warnings
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager, nullcontext, suppress
 from pathlib import Path, PurePosixPath
@@ -19,6 +18,7 @@ from a2tg_jax.base.checks import check_literal
 from a2tg_jax.base.regular_files import expanded
 from a2tg_jax.base.text import counted, first_names
 from a2tg_jax.base.threads import num_threads
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.core.origin import vertical_of
 from a2tg_jax.data.capture_geometry import upright_rotation
 from a2tg_jax.data.colmap_cameras import ColmapCamera
@@ -367,13 +367,12 @@ def _check_models(
     num_pairs, num_flat, alone, blank = matches
     has_no_depth = num_pairs > 1 and num_flat >= MOSTLY_FLAT * num_pairs
     if has_no_depth and is_scene:
-        warnings.warn(f"{given}: {NO_DEPTH}; their poses are a guess", stacklevel=3)
+        warn(f"{given}: {NO_DEPTH}; their poses are a guess")
     blurred_in = [name for name in blurred if name in placed]
     if blurred_in and is_scene:
-        warnings.warn(
+        warn(
             f"{given}: {len(blurred_in)} of the photographs are blurred, and so will the scene be: take them again or "
-            f"remove them ({first_names(blurred_in, MOST_NAMED)})",
-            stacklevel=3,
+            f"remove them ({first_names(blurred_in, MOST_NAMED)})"
         )
     if not left_out:
         return
@@ -415,7 +414,7 @@ def _check_models(
     if gaps:
         reasons.append(f"to connect them, take more photographs between {first_names(gaps, MOST_GAPS)}")
     missing = f"{given}: {len(left_out)} of {len(names)} photographs could not be placed and are left out"
-    warnings.warn("; ".join([f"{missing} ({first_names(left_out, MOST_NAMED)})", *reasons]), stacklevel=3)
+    warn("; ".join([f"{missing} ({first_names(left_out, MOST_NAMED)})", *reasons]))
 
 
 def _gaps(names: Iterable[str], placed: Container[str]) -> list[str]:

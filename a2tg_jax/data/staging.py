@@ -8,7 +8,6 @@ and z towards the middle of the picture. Longitude grows to the right, from -π 
 import itertools
 import os
 import shutil
-import warnings
 from collections import Counter, defaultdict
 from collections.abc import Callable, Container, Iterable, Sequence
 from pathlib import Path, PurePosixPath
@@ -20,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from a2tg_jax.base.regular_files import sha256_of
 from a2tg_jax.base.text import counted, first_names
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.data.decoding import PictureFacts, picture_facts, read_pixels, save_upright
 from a2tg_jax.data.image_files import map_in_threads, on_disk
 from a2tg_jax.data.lenses import sampled
@@ -197,10 +197,7 @@ def _without_copies(photos: Sequence[_Photo]) -> list[_Photo]:
         else:
             copies.append(f"{photo.name} of {first}")
     if copies:
-        warnings.warn(
-            f"left out {counted(len(copies), 'photograph')} with the same bytes as another: {first_names(copies)}",
-            stacklevel=4,
-        )
+        warn(f"left out {counted(len(copies), 'photograph')} with the same bytes as another: {first_names(copies)}")
     return kept
 
 
@@ -226,11 +223,10 @@ def _decided(photos: Sequence[_Photo], videos: Container[int]) -> list[_Photo]:
             unclear.append(photo.name)
         decided.append(photo._replace(kind=kind))
     if unclear:
-        warnings.warn(
+        warn(
             f"{counted(len(unclear), 'picture')} twice as wide as high, such as {unclear[0]}: nothing at the left and "
             "right edges shows whether they join, so these are taken for photographs; `panorama` yes cuts them as "
-            "panoramas of 360° x 180°, `panorama` no leaves them whole without this warning",
-            stacklevel=4,
+            "panoramas of 360° x 180°, `panorama` no leaves them whole without this warning"
         )
     return decided
 

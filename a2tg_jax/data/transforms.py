@@ -10,7 +10,6 @@ both are in the file's own world, which is the original world here. Points of it
 import functools
 import itertools
 import os
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -22,6 +21,7 @@ from a2tg_jax import Scene
 from a2tg_jax.base.json_text import lenient_number, read_json
 from a2tg_jax.base.regular_files import is_regular, names_in
 from a2tg_jax.base.text import first_names, shortened
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.core.cameras import LONGEST_SIDE
 from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, every_kth, rigid_motion, scene_name
 from a2tg_jax.data.colmap import points_in_world_of
@@ -99,7 +99,7 @@ def _split_by_lists(file: Path, shots: Sequence[Shot], lists: dict[str, set[str]
     if unused:
         only = "; val_filenames count only without test_filenames" if val_names else ""
         message = f"{len(unused)} of {len(names)} frames are in no list that is used, such as {unused[0]}{only}"
-        warnings.warn(f"{file}: {message}", stacklevel=4)
+        warn(f"{file}: {message}")
     train = [shot for shot in shots if shot.name in train_names]
     return train, [shot for shot in shots if shot.name in test_names]
 
@@ -138,10 +138,9 @@ def warn_of_others(chosen: Path, files: Sequence[Path]) -> None:
     """Warn of further files of cameras than the one that is read, such as a second export next to it."""
     others = [os.path.relpath(file, chosen.parent) for file in files if file != chosen]
     if others:
-        warnings.warn(
+        warn(
             f"{chosen.parent}: {chosen.name} is read, and not {first_names(others)}; to read another, give that file, "
-            "or a folder without the others",
-            stacklevel=3,
+            "or a folder without the others"
         )
 
 
@@ -163,7 +162,7 @@ def check_images(file: Path, frames: Sequence[object], lacking: Sequence[str], n
         raise ValueError(nothing)
     if lacking:
         message = f"{file}: {len(lacking)} of {len(frames) + len(lacking)} cameras have no image beside them, such as "
-        warnings.warn(f"{message}{shortened(lacking[0])}: not used", stacklevel=3)
+        warn(f"{message}{shortened(lacking[0])}: not used")
 
 
 def _points_beside(file: Path, metas: Sequence[dict[str, Any]], shots: Sequence[Shot]) -> PointCloud | None:

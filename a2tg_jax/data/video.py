@@ -4,7 +4,6 @@ A first pass scores small greyscale frames, a second one writes the chosen ones.
 """
 
 import sys
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +14,7 @@ from PIL import Image
 from scipy.ndimage import laplace
 
 from a2tg_jax.base.regular_files import open_regular
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.data.decoding import MAX_PIXELS
 from a2tg_jax.host.errors import as_argument
 from a2tg_jax.host.optional import optional
@@ -67,7 +67,7 @@ def extract_frames(video: Path, folder: Path, count: int, *, progress: bool = Tr
         raise ValueError(f"{video}: has no frames that can be decoded; {_conversion(video)}")
     if is_interlaced:
         advice = _conversion(video, "-vf bwdif")
-        warnings.warn(f"{video}: is interlaced, so that moving edges look like combs; {advice}", stacklevel=2)
+        warn(f"{video}: is interlaced, so that moving edges look like combs; {advice}")
     chosen = set(choose_frames(np.array(scores), np.array(places), count).tolist())
     folder.mkdir(parents=True)
     # Decoded again, because all frames would not fit into memory.
@@ -155,10 +155,9 @@ def _chosen_stream(video: Path) -> tuple[int, tuple[int, int]]:
         chosen = max(streams, key=lambda stream: int(stream.width * stream.height))
         if len(streams) > 1:
             names = ", ".join(f"{stream.index} ({stream.width}x{stream.height})" for stream in streams)
-            warnings.warn(
+            warn(
                 f"{video}: has the video streams {names}; {chosen.index} is read. To write another: "
-                f"ffmpeg -i {as_argument(video)} -map 0:NUMBER -c copy other.mp4",
-                stacklevel=3,
+                f"ffmpeg -i {as_argument(video)} -map 0:NUMBER -c copy other.mp4"
             )
         aspect = float(chosen.sample_aspect_ratio or 1)  # Of a pixel; 0: unknown.
         # The shorter side of the pixels grows, so that nothing is lost.

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from a2tg_jax.base.checks import check_number
+from a2tg_jax.base.checks import check_fields
 from a2tg_jax.core.budget import number_to_reach
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.optim import AdamState
@@ -78,10 +78,9 @@ class CloneSplitPrune(StepEvent):
     impossible: ClassVar[str] = "adaptive density control would prune every Gaussian; a lower least_opacity keeps some"
 
     def check_options(self) -> None:
-        check_number("cap", self.cap, least=2)
-        for name in ("threshold", "dense_share", "largest_share"):
-            check_number(name, getattr(self, name), least=0)
-        check_number("least_opacity", self.least_opacity, least=0, most=0.99)
+        check_fields(self, "cap", least=2)
+        check_fields(self, "threshold", "dense_share", "largest_share", least=0)
+        check_fields(self, "least_opacity", least=0, most=0.99)
 
     @property
     def statistic(self) -> Statistic:
@@ -220,7 +219,7 @@ class OpacityReset(StepEvent):
     num_keys: ClassVar[int] = 0
 
     def check_options(self) -> None:
-        check_number("most", self.most, above=0, below=1)
+        check_fields(self, "most", above=0, below=1)
 
     def times(self, num_iterations: int) -> Times:
         every = int(reset_interval(num_iterations))

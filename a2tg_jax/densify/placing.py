@@ -15,7 +15,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from a2tg_jax.appearance import allocate_appearance
-from a2tg_jax.base.checks import check_number
+from a2tg_jax.base.checks import check_fields
 from a2tg_jax.base.even_spacing import evenly_chosen
 from a2tg_jax.core.cameras import back_project
 from a2tg_jax.core.gaussians import Gaussians, no_rows, sh_of_colors
@@ -23,7 +23,7 @@ from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.origin import Color
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.table import is_table, map_rows
-from a2tg_jax.events import Change, Due, HostEvent, Times, clear_moments, times_at
+from a2tg_jax.events import Change, Due, FractionsEvent, clear_moments
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderOutput
 from a2tg_jax.render import jitted_render
@@ -39,7 +39,7 @@ LEAST_ALPHA = 0.5
 
 
 @pytree
-class PlaceByError(HostEvent):
+class PlaceByError(FractionsEvent):
     """Event that adds Gaussians on the rendered surface, at pixels drawn in proportion to their error.
 
     After ConeGS (Baranowski et al., 2025). Errors are measured in up to 48 views over the background of training (black
@@ -58,15 +58,9 @@ class PlaceByError(HostEvent):
     """Largest number of Gaussians, at most the rows that densification has allocated."""
 
     def check_options(self) -> None:
-        check_number("share", self.share, least=0, most=1)
-        check_number("cap", self.cap, least=2)
-        self.times(1)  # checks `at`
-
-    def times(self, num_iterations: int) -> Times:
-        return times_at(self.at, num_iterations)
-
-    def num_programs(self, num_iterations: int) -> int:
-        return 2  # Rows keep their number; tile lists grow with the Gaussians.
+        super().check_options()
+        check_fields(self, "share", least=0, most=1)
+        check_fields(self, "cap", least=2)
 
     def apply(self, due: Due, model: Model, moments: AdamState, state: object) -> Change:
         if any(map(is_table, jax.tree.leaves(model.appearance, is_leaf=is_table))):

@@ -16,32 +16,21 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.base.checks import check_number
+from a2tg_jax.base.checks import check_fields
 from a2tg_jax.base.text import counted
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree, static
-from a2tg_jax.events import LEAST_LEFT, Change, Due, HostEvent, Times, keep_rows, times_at
+from a2tg_jax.core.sight import Sight
+from a2tg_jax.events import LEAST_LEFT, Change, Due, FractionsEvent, keep_rows
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.scene import View, counted_pixels, views_by_kind
 
 
-class _Pruning(HostEvent):
-    """Base of events that prune at fractions `at` of a stage."""
-
-    at: tuple[float, ...]
-
-    def times(self, num_iterations: int) -> Times:
-        return times_at(self.at, num_iterations, with_end=True)
-
-    def num_programs(self, num_iterations: int) -> int:
-        return 2  # Rows keep their number; tile lists grow with the Gaussians.
-
-
 @pytree
-class Prune(_Pruning):
+class Prune(FractionsEvent):
     """Event that prunes the Gaussians with the smallest blending weights, summed over the training views.
 
     After Mini-Splatting (Fang and Wang, 2024).
@@ -61,11 +50,12 @@ class Prune(_Pruning):
     at: tuple[float, ...] = static(default=(1.0,))
     """Fractions of the stage at which Gaussians are pruned; 1: at its end."""
 
+    with_end = True
+
     def check_options(self) -> None:
-        check_number("share", self.share, least=0, below=1)
-        if self.keep is not None:
-            check_number("keep", self.keep, least=LEAST_LEFT)
-        self.times(1)  # checks `at`
+        super().check_options()
+        check_fields(self, "share", least=0, below=1)
+        check_fields(self, "keep", least=LEAST_LEFT)
 
     def num_after(self, num: int, num_iterations: int) -> int:
         return num if self.keep is None else min(num, self.keep)
@@ -84,12 +74,6 @@ class Prune(_Pruning):
         is_kept = np.zeros(num, bool)
         is_kept[np.argsort(-weights[:num], kind="stable")[:left]] = True
         return keep_rows(model, moments, state, is_kept)
-
-
-def during_growth(at: tuple[float, ...], num_iterations: int, growth: Times) -> tuple[float, ...]:
-    """Return the fractions of a stage before its last growth, so that others replace what is pruned."""
-    last = growth[-1] if growth else 0
-    return tuple(fraction for fraction in at if round(fraction * num_iterations) < last)
 
 
 class Contributions(NamedTuple):
@@ -160,7 +144,7 @@ def _weights(
 
 
 @pytree
-class PruneFloaters(_Pruning):
+class PruneFloaters(FractionsEvent):
     """Event that prunes the Gaussians that show in too few training views, or are close to a camera.
 
     Each view can learn splats close to its own camera that no other view contradicts. It uses the cameras of the scene,
@@ -178,14 +162,15 @@ class PruneFloaters(_Pruning):
     """Fractions of the stage at which Gaussians are pruned; 1: at its end. In a system, those after the last growth are
     left out."""
 
+    with_end = True
+
     def check_options(self) -> None:
+        super().check_options()
         if self.min_views:
-            check_number("min_views", self.min_views, least=2)
-        check_number("near", self.near, least=0)
-        check_number("least", self.least, least=0)
+            check_fields(self, "min_views", least=2)
+        check_fields(self, "near", "least", least=0)
         if not self.at:
             raise ValueError("at must hold at least one fraction of the stage; got none")
-        self.times(1)  # checks `at`
 
     def apply(self, due: Due, model: Model, moments: AdamState, state: object) -> Change:
         num = model.num
@@ -213,21 +198,6 @@ def are_near(means: np.ndarray, views: Sequence[View], near: float) -> np.ndarra
     """
     is_near = np.zeros(len(means), bool)
     for view in views:
-        camera = view.camera
-        viewmat = np.asarray(camera.viewmat, np.float64)
-        K = np.asarray(camera.K, np.float64)
-        x, y, z = viewmat[:3, :3] @ means.T + viewmat[:3, 3:]
-        # Behind the camera nothing is inside: comparisons with NaN are False.
-        depth = np.where(z > 0, z, np.nan)
-        column, row, _ = K @ np.stack([x / depth, y / depth, np.ones_like(z)])
-        low = np.zeros(2)
-        high = np.asarray([camera.width, camera.height])
-        if camera.rays is not None:
-            rays = np.asarray(camera.rays, np.float64).reshape(-1, 2)
-            # Without any ray left, the rectangle is inverted and contains nothing.
-            rays = rays[np.isfinite(rays).all(axis=1)]
-            low = rays.min(axis=0, initial=np.inf)
-            high = rays.max(axis=0, initial=-np.inf)
-        is_inside = (column >= low[0]) & (column <= high[0]) & (row >= low[1]) & (row <= high[1])
-        is_near |= is_inside & (z < near)
+        is_seen, depths = Sight.of_camera(view.camera).seen(means, 0.0)
+        is_near |= is_seen & (depths < near)
     return is_near

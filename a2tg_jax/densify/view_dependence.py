@@ -14,14 +14,14 @@ from jax import Array
 from jax.typing import DTypeLike
 
 from a2tg_jax.appearance.parts import MAX_DEGREE, Coefficients, degrees_of_sizes, floats_of_band, sizes_of_degrees
-from a2tg_jax.base.checks import check_number
+from a2tg_jax.base.checks import check_fields
 from a2tg_jax.base.text import bytes_of
 from a2tg_jax.core.budget import BYTES_PER_FLOAT, MOST_ROOM, event_budget, within_budget
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.sh import NUM_BASES, directions_from, sh_basis
 from a2tg_jax.core.table import Layout, Size, resize
-from a2tg_jax.events import Change, Due, HostEvent, Seen, Times, times_at
+from a2tg_jax.events import Change, Due, FractionsEvent, Seen
 from a2tg_jax.model import Model
 
 
@@ -57,7 +57,7 @@ class BandStatistics:
 
 
 @pytree
-class AdaptDegrees(HostEvent):
+class AdaptDegrees(FractionsEvent):
     """Event that lowers idle degrees and raises others by one where the gradient per byte is largest, within a budget.
 
     It needs an appearance with `Bands`.
@@ -75,13 +75,9 @@ class AdaptDegrees(HostEvent):
     observes = True  # `Seen.colors`, which needs no statistic
 
     def check_options(self) -> None:
-        check_number("budget_mb", self.budget_mb, least=0)
-        check_number("highest", self.highest, least=0, most=MAX_DEGREE)
-        check_number("idle", self.idle, least=0)
-        self.times(1)  # checks `at`
-
-    def times(self, num_iterations: int) -> Times:
-        return times_at(self.at, num_iterations)
+        super().check_options()
+        check_fields(self, "budget_mb", "idle", least=0)
+        check_fields(self, "highest", least=0, most=MAX_DEGREE)
 
     def num_programs(self, num_iterations: int) -> int:
         return 0  # `with_room` has made room, unless degrees may take more than half of the budget.

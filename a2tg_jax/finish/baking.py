@@ -73,18 +73,22 @@ def bake(
       cameras: views that the new model is trained on.
       growth: largest ratio of the bytes of all floats to the model's. If Gaussians differ in degree, the common
         degree is lowered until one splat for each fits.
-      iterations: number of iterations on pictures of the model; 0: no training.
+      iterations: number of iterations on pictures of the model; 0: no training. A single splat is not trained.
       progress: show a progress bar.
 
     Raises:
-      ValueError: if there are no cameras, or the growth is less than 1.
+      ValueError: if there are no cameras or no Gaussians, or the growth is less than 1.
     """
     if not cameras or not growth >= 1:
         raise ValueError(f"baking needs cameras and a growth of at least 1; got {len(cameras)} and {growth}")
     model = model.live
+    if not model.num:
+        raise ValueError("the model has no Gaussians to bake: give another model")
     # Splitting renders each view several times, for which some of them suffice; training uses all.
     baked = split_splats(model, evenly_chosen(cameras, MOST_VIEWS), growth)
-    return distill(baked, model, cameras, iterations=iterations, progress=progress) if iterations else baked
+    if iterations == 0 or baked.num == 1:
+        return baked
+    return distill(baked, model, cameras, iterations=iterations, progress=progress)
 
 
 def split_splats(model: Model, cameras: Sequence[Camera], growth: float) -> Model:

@@ -442,7 +442,7 @@ class ColumnReader:
 
     def exact(self, name: str, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
         planes = self.planes(name, np.dtype(dtype).itemsize, math.prod(shape))
-        return from_byte_planes(planes, 1, np.dtype(dtype)).reshape(shape).astype(np.dtype(dtype))
+        return from_byte_planes(planes, 1, dtype).reshape(shape).astype(dtype)
 
     def indices(self, name: str, length: int, count: int) -> np.ndarray:
         if count == 0 and length:

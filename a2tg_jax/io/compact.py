@@ -23,8 +23,8 @@ from a2tg_jax.base.checks import check_int, check_literal
 from a2tg_jax.base.config_json import config_from_dict, config_to_dict
 from a2tg_jax.base.json_text import parse_json
 from a2tg_jax.base.named_fields import NamedFields
-from a2tg_jax.base.regular_files import existing_bytes, expanded, reading, room_of
-from a2tg_jax.base.suffixes import check_suffix
+from a2tg_jax.base.regular_files import existing_bytes, reading, room_of
+from a2tg_jax.base.suffixes import checked_path
 from a2tg_jax.io.columns import (
     MOST_BITS,
     AxisSteps,
@@ -156,10 +156,10 @@ def save_compact(
       >>> Path("scene.a2tgz").stat().st_size < model.num_bytes / 2
       True
     """
-    check_suffix(path, "save_compact")
+    path = checked_path(path, "save_compact")
     check_is_model(model)
     data = encode_model(model, choices, grids)
-    write_whole(expanded(path), data)
+    write_whole(path, data)
 
 
 def load_compact(path: str | os.PathLike[str]) -> Model:
@@ -180,9 +180,8 @@ def load_compact(path: str | os.PathLike[str]) -> Model:
       >>> a2tg.load_compact("scene.a2tgz").num
       200
     """
-    check_suffix(path, "load_compact")
-    path = expanded(path)
-    return decode_model(existing_bytes(path, "compact scene"), os.fspath(path))
+    path = checked_path(path, "load_compact")
+    return decode_model(existing_bytes(path, "compact scene"), str(path))
 
 
 def encode_model(

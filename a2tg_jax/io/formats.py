@@ -86,26 +86,26 @@ FORMATS = {
 """Formats by suffix. If two match a name, the first is used."""
 
 
-def format_of(path: str | os.PathLike[str]) -> FileFormat:
+def format_of(path: Path) -> FileFormat:
     """Return the format of a file by its suffix. ValueError: the suffix is unknown."""
     # Not Path.suffix: .compressed.ply has two dots.
-    name = Path(path).name.lower()
+    name = path.name.lower()
     for suffix, format in FORMATS.items():
         if name.endswith(suffix):
             return format
     near = did_you_mean(Path(name).suffix, FORMATS)
     if name.endswith(".zip"):
         near = "; if it is SOG, rename it to *.sog; otherwise unpack it"
-    hint = model_hint(Path(path)) or f"{near}; known are {', '.join(FORMATS)}"
-    raise ValueError(f"{shortened(os.fspath(path))}: unknown suffix{hint}")
+    hint = model_hint(path) or f"{near}; known are {', '.join(FORMATS)}"
+    raise ValueError(f"{shortened(str(path))}: unknown suffix{hint}")
 
 
-def writer_of(path: str | os.PathLike[str]) -> Writer:
+def writer_of(path: Path) -> Writer:
     """Return the function that writes a file, by its suffix, after importing what it needs. ValueError: the suffix is
     unknown, an optional library is missing, or the format is read-only."""
     format = format_of(path)
     if format.save is None:
-        raise ValueError(f"{shortened(os.fspath(path))}: {format.name} can be read, but not written; write *.sog")
+        raise ValueError(f"{shortened(str(path))}: {format.name} can be read, but not written; write *.sog")
     if format.import_library is not None:
         format.import_library()
     return format.save
@@ -158,11 +158,12 @@ def save_splats(path: str | os.PathLike[str], model: Model, *, world: World = "o
       >>> a2tg.load_splats("scene.splat").num
       200
     """
+    path = expanded(path)
     save = writer_of(path)
     if format_of(path).keeps_origin:
-        save(expanded(path), model)
+        save(path, model)
     else:
-        save(expanded(path), model, world=world)
+        save(path, model, world=world)
 
 
 def files_written(path: Path) -> list[Path]:
@@ -194,12 +195,12 @@ def _bakeable(model: Model) -> str:
     return f"{' and '.join(shown)} (bake turns them into plain splats)" if shown else ""
 
 
-def unseen_elsewhere(model: Model, path: str | os.PathLike[str]) -> str:
+def unseen_elsewhere(model: Model, path: Path) -> str:
     """Describe what a file keeps of a model, by its suffix, but other programs do not show; "" if nothing."""
     return _bakeable(model) if format_of(path).has_extension else ""
 
 
-def lost_by(model: Model, path: str | os.PathLike[str]) -> list[str]:
+def lost_by(model: Model, path: Path) -> list[str]:
     """Describe what a file, by its suffix, does not keep of a model."""
     into = format_of(path)
     shown = model.appearance

@@ -6,7 +6,6 @@ the extension A2TG_splat_textures; programs without it show plain splats. docs/f
 """
 
 import os
-import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
@@ -17,9 +16,10 @@ from a2tg_jax.appearance.parts import MAX_DEGREE
 from a2tg_jax.base.checks import check_int, check_literal
 from a2tg_jax.base.config_json import config_from_dict
 from a2tg_jax.base.json_text import number_array
-from a2tg_jax.base.regular_files import expanded, reading
-from a2tg_jax.base.suffixes import check_suffix
+from a2tg_jax.base.regular_files import reading
+from a2tg_jax.base.suffixes import checked_path
 from a2tg_jax.base.text import shortened
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.core.sh import NUM_BASES, SH_C0
 from a2tg_jax.io.columns import Ends, checked_shapes, dequantised, ends_of, log_exponents_of, quantised
 from a2tg_jax.io.gltf_container import Builder, Document, mesh_nodes, scene_of_one
@@ -107,7 +107,7 @@ def save_gltf(
       200
     """
     check_literal("texels", texels, TexelKind)
-    check_suffix(path, "save_gltf")
+    path = checked_path(path, "save_gltf")
     model = checked_live(model)
     # glTF has no accessors of count 0.
     if not model.num:
@@ -149,7 +149,7 @@ def save_gltf(
     # Mode 0: points, which programs without the extension show.
     primitive = {"attributes": attributes, "mode": 0, "extensions": {SPLATS: described}, "extras": {OWN: kept}}
     used = [SPLATS, *described.get("extensions", {})]
-    builder.save(expanded(path), {"extensionsUsed": used, **scene_of_one(node, primitive)})
+    builder.save(path, {"extensionsUsed": used, **scene_of_one(node, primitive)})
 
 
 def _extension_of(builder: Builder, model: Model, kind: TexelKind) -> dict[str, Any]:
@@ -201,8 +201,7 @@ def load_gltf(path: str | os.PathLike[str]) -> Model:
       FileNotFoundError: if there is no such file.
       ValueError: if it is not glTF 2.0, is damaged, holds no splats, or needs an unsupported extension.
     """
-    check_suffix(path, "load_gltf")
-    path = expanded(path)
+    path = checked_path(path, "load_gltf")
     with reading(path):
         document = Document(path)
         unknown = [name for name in document.json.get("extensionsRequired", []) if name not in READ]
@@ -233,7 +232,7 @@ def _model_of(document: Document, primitive: Mapping[str, Any]) -> Model:
         value = described.get(name)
         if value != DESCRIBED[name]:
             message = f"its splats have the {name} {shortened(value)}; they are read as {DESCRIBED[name]}"
-            warnings.warn(f"{document.path}: {message}", stacklevel=5)
+            warn(f"{document.path}: {message}")
     extras = primitive.get("extras", {})
     kept = extras.get(OWN, {}) if isinstance(extras, dict) else {}
     origin = origin_of(kept["origin"], kept["origin"]) if "origin" in kept else None

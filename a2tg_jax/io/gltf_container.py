@@ -8,7 +8,6 @@ import base64
 import binascii
 import json
 import math
-import os
 import struct
 import urllib.parse
 from collections.abc import Iterator, Mapping
@@ -152,8 +151,8 @@ class Document:
     """A file's JSON, and the numbers of its accessors. FileNotFoundError: there is no such file. ValueError: it is not
     glTF 2.0, or is damaged."""
 
-    def __init__(self, path: str | os.PathLike[str]):
-        self.path = Path(path)
+    def __init__(self, path: Path):
+        self.path = path
         data = existing_bytes(path, "glTF file")
         self._binary: bytes | None = None
         text = data

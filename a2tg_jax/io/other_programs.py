@@ -8,9 +8,7 @@ are relative to an offset.
 import collections
 import dataclasses
 import math
-import os
 import string
-import warnings
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -26,6 +24,7 @@ from a2tg_jax.base.atomic import write_whole
 from a2tg_jax.base.checks import LARGEST_NUMBER, check_literal
 from a2tg_jax.base.regular_files import existing_bytes, reading
 from a2tg_jax.base.text import counted, first_names, shortened
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.core.gaussians import LARGEST_LOG_SCALE, LARGEST_OPACITY
 from a2tg_jax.core.origin import check_origin
 from a2tg_jax.core.sh import NUM_BASES, SH_C0
@@ -209,13 +208,13 @@ def writer_as(kind: Kind, encode: Callable[[PlacedSplats], bytes]) -> Callable[.
     or the format cannot hold their positions.
     """
 
-    def save(path: str | os.PathLike[str], model: Gaussians | Model, *, world: World = "original") -> None:
+    def save(path: Path, model: Gaussians | Model, *, world: World = "original") -> None:
         placed = world_gaussians(model, kind=kind, world=world)
         gaussians = placed.gaussians
         if not gaussians.num:
             raise ValueError(f"{path}: the model has no Gaussians; a file of this format has at least one")
         check_model(Model(gaussians))  # Never write a file that would not load.
-        check_positions(kind, gaussians, os.fspath(path))
+        check_positions(kind, gaussians, path)
         means = np.asarray(gaussians.means, np.float64)
         low = means.min(axis=0)
         high = means.max(axis=0)
@@ -295,9 +294,7 @@ def linear_colors(colors: np.ndarray) -> np.ndarray:
 # From a file to Gaussians
 
 
-def gaussians_of(
-    splats: Ellipsoids, path: str | os.PathLike[str], *, is_flat: bool, keeps_all: bool = False
-) -> Gaussians:
+def gaussians_of(splats: Ellipsoids, path: Path, *, is_flat: bool, keeps_all: bool = False) -> Gaussians:
     """Return the Gaussians of a file's splats, whose third axis is the normal if the file `is_flat`.
 
     Otherwise the thinnest axis becomes the normal. Splats that cannot be drawn are left out with a warning, unless
@@ -309,10 +306,10 @@ def gaussians_of(
         log_scales = log_scales[:, :2]
     logits = logits_of(np.clip(splats.opacities.astype(np.float64), LEAST_OPACITY, LARGEST_OPACITY))
     rows = FileRows(splats.means, splats.quats, log_scales, logits, splats.sh)
-    return flat_rows(os.fspath(path), rows, keeps_all=keeps_all).gaussians
+    return flat_rows(str(path), rows, keeps_all=keeps_all).gaussians
 
 
-def model_of_splats(splats: Ellipsoids, path: str | os.PathLike[str], *, is_flat: bool = False, **fields: Any) -> Model:
+def model_of_splats(splats: Ellipsoids, path: Path, *, is_flat: bool = False, **fields: Any) -> Model:
     """Return the model of a file's splats, as `gaussians_of`, with further fields of the model. ValueError: none of the
     splats can be drawn."""
     model = Model(gaussians_of(splats, path, is_flat=is_flat), **fields)
@@ -351,7 +348,7 @@ def flat_rows(name: str, rows: FileRows, *, keeps_all: bool = False) -> FileRows
             f"{name}: {counted(len(unrotated), 'Gaussian')} of {len(lengths):,} with the rotation 0 0 0 0, read as "
             f"unrotated; the first is row {unrotated[0]:,} (from 0)"
         )
-        warnings.warn(message, stacklevel=4)
+        warn(message)
         quats[unrotated] = [1, 0, 0, 0]
     # The squares of these leave the range of float32.
     is_extreme = ((lengths > 0) & (lengths < LEAST_LENGTH)) | (np.isfinite(lengths) & (lengths > 1 / LEAST_LENGTH))
@@ -399,7 +396,7 @@ def drawable_rows(name: str, rows: FileRows) -> np.ndarray:
             f"NaN, infinite or too large to draw (beyond ±{LARGEST_NUMBER:g}); the first is row {first:,} (from 0), "
             f"with {what}"
         )
-        warnings.warn(message, stacklevel=5)
+        warn(message)
     return is_drawable
 
 
@@ -440,7 +437,7 @@ def flattened(quats: np.ndarray, log_scales: np.ndarray, name: str) -> tuple[np.
     num_thick = np.count_nonzero(dropped > kept.min(axis=1) + np.log(2 * THICKNESS))
     if num_thick:
         message = f"{name}: holds 3D Gaussians (scale_2), {num_thick} of them not flat; their thinnest axis is dropped"
-        warnings.warn(message, stacklevel=4)
+        warn(message)
     # The product of quaternions: the turn of the axes first, then the splat's own rotation.
     w, x, y, z = quats.T
     a, b, c, d = AXES_TO_NORMAL[thinnest].T
@@ -453,7 +450,7 @@ def flattened(quats: np.ndarray, log_scales: np.ndarray, name: str) -> tuple[np.
     return np.stack(product, axis=-1), kept
 
 
-def warn_of_unread(names: Iterable[str], path: str | os.PathLike[str]) -> None:
+def warn_of_unread(names: Iterable[str], path: Path) -> None:
     """Warn of the attributes of a file's Gaussians that are not read, unless there are none; f_rest_* is read."""
     # Many names differ in a number only, and f_offset_9 comes before f_offset_10.
     by_stem: dict[str, list[str]] = collections.defaultdict(list)
@@ -463,17 +460,17 @@ def warn_of_unread(names: Iterable[str], path: str | os.PathLike[str]) -> None:
     kinds = [alike[0] if len(alike) == 1 else f"{alike[0]} to {alike[-1]}" for alike in by_stem.values()]
     if kinds:
         message = (
-            f"{os.fspath(path)}: does not read {first_names(kinds)}; if the program that "
+            f"{path}: does not read {first_names(kinds)}; if the program that "
             "wrote the file draws by these attributes, its Gaussians look different here"
         )
-        warnings.warn(message, stacklevel=5)
+        warn(message)
 
 
 def degree_to_read(degree: int, name: str) -> int:
     """Return the SH degree to read from a file, at most 3. Warn if the file's is higher."""
     if degree > MAX_DEGREE:
         message = f"{name}: has SH of degree {degree}; degree {MAX_DEGREE} is read, and what is above it left out"
-        warnings.warn(message, stacklevel=4)
+        warn(message)
     return min(degree, MAX_DEGREE)
 
 
@@ -648,15 +645,15 @@ def origin_at(offset: np.ndarray, turn: np.ndarray = UNMOVED.rotation) -> Origin
     return origin
 
 
-def warn_of_offset(kind: Kind, offset: np.ndarray, path: str | os.PathLike[str]) -> None:
+def warn_of_offset(kind: Kind, offset: np.ndarray, path: Path | str) -> None:
     """Warn that the positions of a file are relative to an offset [3], unless it is zero."""
     if offset.any():
         place = OFFSET_PLACES.get(kind, "the file has no place for this: write it down")
         message = (
-            f"{os.fspath(path)}: positions are relative to ({', '.join(number_words(offset))}), because the format "
+            f"{path}: positions are relative to ({', '.join(number_words(offset))}), because the format "
             f"would round such large coordinates too far; {place}"
         )
-        warnings.warn(message, stacklevel=3)
+        warn(message)
 
 
 def number_words(numbers: np.ndarray) -> list[str]:
@@ -664,7 +661,7 @@ def number_words(numbers: np.ndarray) -> list[str]:
     return [repr(float(value)).removesuffix(".0") for value in numbers]
 
 
-def check_positions(kind: Kind, gaussians: Gaussians, name: str) -> None:
+def check_positions(kind: Kind, gaussians: Gaussians, path: Path) -> None:
     """Raise ValueError if a format cannot hold the positions of one or more Gaussians; warn if it rounds them too far.
 
     Messages name the file.
@@ -673,15 +670,15 @@ def check_positions(kind: Kind, gaussians: Gaussians, name: str) -> None:
     farthest = np.abs(means).max()
     if kind == "spz" and farthest > SPZ_REACH:
         raise ValueError(
-            f"{name}: SPZ holds positions up to {SPZ_REACH:.0f} units from the origin, but one is {farthest:,.0f} "
+            f"{path}: SPZ holds positions up to {SPZ_REACH:.0f} units from the origin, but one is {farthest:,.0f} "
             "units away; write *.ply or *.sog, or scale the scene"
         )
     scales = np.exp(np.asarray(gaussians.log_scales, np.float64).mean(axis=1))
     rounding = float(np.median(_rounding(kind, means) / scales))
     if rounding > MOST_ROUNDING:
         advice = "write *.ply or *.sog, or enlarge the scene" if kind == "spz" else "write *.ply"
-        message = f"{name}: positions are rounded by {rounding:.2g} times the scale of a typical Gaussian; {advice}"
-        warnings.warn(message, stacklevel=4)
+        message = f"{path}: positions are rounded by {rounding:.2g} times the scale of a typical Gaussian; {advice}"
+        warn(message)
 
 
 def _rounding(kind: Kind, means: np.ndarray) -> np.ndarray:

@@ -15,7 +15,6 @@ rotation as the index of its largest number and the three others in 10 bits; col
 """
 
 import os
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import BinaryIO
@@ -27,8 +26,9 @@ from scipy.spatial.transform import Rotation
 from a2tg_jax import Gaussians, Model, Similarity
 from a2tg_jax.appearance.parts import LEAST_OPACITY
 from a2tg_jax.base.atomic import write_whole
-from a2tg_jax.base.regular_files import check_exists, expanded, open_regular, reading
-from a2tg_jax.base.suffixes import check_suffix
+from a2tg_jax.base.regular_files import check_exists, open_regular, reading
+from a2tg_jax.base.suffixes import checked_path
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.core.sh import NUM_BASES, SH_C0
 from a2tg_jax.data.other_runs import model_hint
 from a2tg_jax.data.ply import OFFSET, RGB, ROTATION, SH_DEGREE0, PlyFile, largest_color
@@ -107,8 +107,7 @@ def save_ply(
       >>> a2tg.load_ply("scene.ply").num
       200
     """
-    check_suffix(path, "save_ply")
-    path = expanded(path)
+    path = checked_path(path, "save_ply")
     placed = world_gaussians(gaussians, transform, world=world)
     third = third_log_scales(np.asarray(placed.gaussians.log_scales)) if third_scale else None
     offset = np.zeros(3) if float64 else placed.offset
@@ -211,17 +210,16 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
       >>> a2tg.load_ply("scene.ply").sh_degree
       1
     """
-    check_suffix(path, "load_ply")
+    path = checked_path(path, "load_ply")
     model = load_ply_model(path)
     if model.origin is not None and model.origin.transform.translation.any():
         offset = ", ".join(number_words(-model.origin.transform.translation))
-        warnings.warn(f"{path}: positions are relative to ({offset}); load_splats keeps this offset", stacklevel=2)
+        warn(f"{path}: positions are relative to ({offset}); load_splats keeps this offset")
     return model.gaussians
 
 
-def load_ply_model(path: str | os.PathLike[str]) -> Model:
+def load_ply_model(path: Path) -> Model:
     """Return the Gaussians of `load_ply` as a model, with the offset of the positions, if any, in its origin."""
-    path = expanded(path)
     check_exists(path, f"PLY file{model_hint(path)}")
     with open_regular(path) as file:
         return decode_ply(file, path)

@@ -7,10 +7,10 @@ write PLY files.
 """
 
 import math
-import os
 import pickle
 import zipfile
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 
@@ -58,15 +58,13 @@ def to_gsplat(model: Gaussians | Model, *, world: World = "original") -> dict[st
     return _splats_of(placed.gaussians)
 
 
-def save_checkpoint_gaussians(
-    path: str | os.PathLike[str], model: Gaussians | Model, *, world: World = "original"
-) -> None:
+def save_checkpoint_gaussians(path: Path, model: Gaussians | Model, *, world: World = "original") -> None:
     """Write the Gaussians of a model as a checkpoint, of Nerfstudio's splatfacto if the suffix is *.ckpt, else of
     gsplat. Arguments and errors as in `to_gsplat`."""
     placed = world_gaussians(model, world=world)
     splats = _splats_of(placed.gaussians)
     checkpoint: dict[str, object] = {"step": 0, "splats": splats}
-    if os.fspath(path).lower().endswith(".ckpt"):
+    if path.suffix.lower() == ".ckpt":
         # splatfacto has one size of each parameter, the one of degree 3.
         rest = np.zeros((placed.gaussians.num, NUM_BASES[-1] - 1, 3), np.float32)
         rest[:, : splats["shN"].shape[1]] = splats["shN"]

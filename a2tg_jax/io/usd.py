@@ -21,8 +21,8 @@ from a2tg_jax import Model
 from a2tg_jax.base.atomic import replacing
 from a2tg_jax.base.json_text import parse_json
 from a2tg_jax.base.npz import read_npz
-from a2tg_jax.base.regular_files import MOST_ARRAY_BYTES, check_exists, expanded, open_regular, reading
-from a2tg_jax.base.suffixes import check_suffix
+from a2tg_jax.base.regular_files import MOST_ARRAY_BYTES, check_exists, open_regular, reading
+from a2tg_jax.base.suffixes import checked_path
 from a2tg_jax.base.text import shortened
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.io import usd_fields
@@ -57,9 +57,8 @@ def save_usd(path: str | os.PathLike[str], model: Model, *, ellipsoids: bool = F
     Raises:
       ValueError: if usd-core is missing, or the model has a number that is not finite or too large.
     """
-    check_suffix(path, "save_usd")
+    path = checked_path(path, "save_usd")
     stage = _stage_of(checked_live(model), ellipsoids)
-    path = expanded(path)
     # usd-core chooses the format by the suffix, which the temporary path lacks.
     with replacing(path) as temporary, tempfile.TemporaryDirectory(dir=path.parent) as folder:
         suffix = path.suffix.lower() if path.suffix.lower() in (".usda", ".usdz") else ".usdc"
@@ -150,9 +149,8 @@ def load_usd(path: str | os.PathLike[str]) -> Model:
       FileNotFoundError: if there is no such file.
       ValueError: if usd-core is missing, or the file is not USD, is damaged, or holds no splats.
     """
-    check_suffix(path, "load_usd")
+    path = checked_path(path, "load_usd")
     import_usd()
-    path = expanded(path)
     check_exists(path, "USD file")
     # usd-core opens the path itself: this checks the size and the permission first.
     open_regular(path, MOST_ARRAY_BYTES).close()

@@ -23,15 +23,14 @@ SUFFIXES = (".glb", ".ply", ".obj")
 JPEG_QUALITY = 92
 
 
-def check_mesh_suffix(path: str | os.PathLike[str], name: str = "path") -> None:
+def check_mesh_suffix(path: Path, name: str = "path") -> None:
     """Raise ValueError unless a path ends in a suffix of meshes."""
-    if Path(path).suffix.lower() not in SUFFIXES:
+    if path.suffix.lower() not in SUFFIXES:
         raise ValueError(f"{name} must end in {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}; got {path}")
 
 
-def mesh_files(path: str | os.PathLike[str], *, has_texture: bool) -> list[Path]:
+def mesh_files(path: Path, *, has_texture: bool) -> list[Path]:
     """Return the files that `save_mesh` writes for a path, the path first."""
-    path = Path(path)
     beside = (".mtl", ".png") if has_texture and path.suffix.lower() == ".obj" else ()
     return [path, *(path.with_suffix(suffix) for suffix in beside)]
 
@@ -62,8 +61,8 @@ def save_mesh(path: str | os.PathLike[str], mesh: Mesh, transform: Similarity | 
       >>> len(a2tg.save_mesh("triangle.obj", mesh))
       1
     """
-    check_mesh_suffix(path)
     path = expanded(path)
+    check_mesh_suffix(path)
     suffix = path.suffix.lower()
     if suffix == ".glb":
         _save_glb(path, mesh, transform)

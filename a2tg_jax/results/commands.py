@@ -1,6 +1,7 @@
 """Command lines that messages, run.toml and the report quote. No other module of `results` words them."""
 
 import contextlib
+import dataclasses
 import math
 import os
 import shlex
@@ -8,11 +9,12 @@ from pathlib import Path
 
 from a2tg_jax.base.archive import read_archive_header
 from a2tg_jax.base.config_json import config_from_dict, config_to_dict
+from a2tg_jax.base.json_text import read_object
 from a2tg_jax.base.machine import ALONE, Devices
 from a2tg_jax.base.regular_files import is_regular
 from a2tg_jax.finish.tuning import ITERATIONS
-from a2tg_jax.results.finish_record import read_finish
 from a2tg_jax.results.folder import RunFolder
+from a2tg_jax.results.options import FinishOptions
 
 QUICK_SIDE = 640
 """Longer side of photographs, in pixels, up to which the preset quick takes minutes on two cores."""
@@ -25,7 +27,7 @@ def training_command(run: RunFolder, out: str, *flags: str) -> str:
     return shlex.join(["a2tg", "train", "--config", str(run.record), *flags, "--out", out])
 
 
-def beside(run: RunFolder, what: str) -> str:
+def next_to(run: RunFolder, what: str) -> str:
     """Return the path of another run folder next to one, with an addition to its name."""
     # "." and ".." have no name to add to.
     path = run.path if run.path.name not in ("", "..") else run.path.resolve()
@@ -33,13 +35,17 @@ def beside(run: RunFolder, what: str) -> str:
 
 
 def repeating_command(run: RunFolder) -> str:
-    """Return the command that repeats a run, and its finishing, if any."""
-    again = beside(run, "again")
+    """Return the command that repeats a run, and its finishing, if any. Raises ValueError if finish.json is damaged."""
+    again = next_to(run, "again")
     if not is_regular(run.finish):
         return training_command(run, again)
-    trained = beside(run, "trained")
-    options = config_to_dict(read_finish(run))
-    flags = [f"--{name.replace('_', '-')}={value}" for name, value in options.items()]
+    trained = next_to(run, "trained")
+    # It also names the source.
+    given = read_object(run.finish)
+    names = [field.name for field in dataclasses.fields(FinishOptions)]
+    given = {name: given[name] for name in names if name in given}
+    options = config_from_dict(FinishOptions, given, f"{run.finish}:")
+    flags = [f"--{name.replace('_', '-')}={value}" for name, value in config_to_dict(options).items()]
     finishing = shlex.join(["a2tg", "finish", trained, "--out", again, *flags])
     return f"{training_command(run, trained)} && {finishing}"
 
@@ -70,9 +76,9 @@ def _devices_of_newest_checkpoint(run: RunFolder) -> Devices:
     return ALONE
 
 
-def first_training_command(scene: Path) -> str:
-    """Return the command that trains a scene quickly."""
-    return shlex.join(["a2tg", "train", str(scene), "--out", f"runs/{scene.resolve().name}", "--preset", "quick"])
+def first_training_command(scene: Path, flags: str = "--preset quick") -> str:
+    """Return the command that trains a scene quickly, with flags such as `quick_flags`."""
+    return f"{shlex.join(['a2tg', 'train', str(scene), '--out', f'runs/{scene.resolve().name}'])} {flags}"
 
 
 def quick_flags(longest_side: int, downscale: int = 1) -> str:

@@ -86,7 +86,7 @@ def compress(
     options.check()
     max_bytes = budget_in_bytes(options.file_budget, "file_budget")
     num_iterations = options.tune_iterations
-    if out is not None and (out.is_dir() or out.suffix.lower() != SUFFIX):
+    if out is not None and out.suffix.lower() != SUFFIX:
         raise ValueError(f"out must be the path of a file that ends in {SUFFIX}; got {out}")
     opened = open_source(source)
     model = opened.model
@@ -124,7 +124,9 @@ def compress(
         RunFolder(source).own(out)
     write_whole(out, data)
     lines = _table(trials, tuned, chosen, losses) if verbose else []
-    return "\n".join([*lines, *_notes(tuned, max_bytes), _result(out, model, chosen)])
+    share = f"1/{model.num_bytes / chosen.num_bytes:.1f} of the model's numbers"
+    result = f"{out}: {in_bytes(chosen.num_bytes)} on disk, {share}, {loss_text(chosen.losses[0])}"
+    return "\n".join([*lines, *_notes(tuned, max_bytes), result])
 
 
 def _notes(tuned: TunedFiles, max_bytes: int | None) -> list[str]:
@@ -136,11 +138,6 @@ def _notes(tuned: TunedFiles, max_bytes: int | None) -> list[str]:
         best = f"the best of {len(tuned.tried)} has {in_bytes(min(trial.num_bytes for trial in tuned.tried))}"
         lines.append(f"no tuned file is small enough, {best}: the untuned one is kept")
     return lines
-
-
-def _result(out: Path, model: Model, chosen: Trial) -> str:
-    share = f"1/{model.num_bytes / chosen.num_bytes:.1f} of the model's numbers"
-    return f"{out}: {in_bytes(chosen.num_bytes)} on disk, {share}, {loss_text(chosen.losses[0])}"
 
 
 def _search(

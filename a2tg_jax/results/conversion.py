@@ -75,8 +75,6 @@ def check_conversion(
     # Not Path.resolve, which raises RuntimeError for links in a circle before Python 3.13.
     sources = {os.path.realpath(file) for file in files_of(source)}
     for file in files_written(out):
-        if file.is_dir():
-            raise ValueError(f"{file} is a folder; give the path of a file")
         if os.path.realpath(file) in sources:
             whole = "the source" if file == out else f"part of the source and would be written together with {out}"
             raise ValueError(f"{file} is {whole}: choose another name")

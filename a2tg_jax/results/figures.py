@@ -76,39 +76,39 @@ def write_figures(
     """Write the figures of a run's main model, some of them from one camera, and return them by their places in the
     report. `starts` has the number of iterations before each stage."""
 
-    def written(
-        name: str, content: Figure | np.ndarray, caption: str, kind: str = "",
+    figures: dict[str, list[ReportFigure]] = {"curves": [], "textures": [], "maps": [], "geometry": []}
+
+    def add(
+        place: str, name: str, content: Figure | np.ndarray, caption: str, kind: str = "",
         legend: Sequence[tuple[str, str]] = (),
-    ) -> ReportFigure:  # fmt: skip
+    ) -> None:  # fmt: skip
         path = run.own(run.figures / name)
         if isinstance(content, Figure):
             save_figure(path, content)
         else:
             save_picture(path, content)
-        return ReportFigure(path, caption, kind, legend)
+        figures[place].append(ReportFigure(path, caption, kind, legend))
 
-    figures: dict[str, list[ReportFigure]] = {"curves": [], "textures": [], "maps": [], "geometry": []}
     caption = "Loss and PSNR of the training views seen, with running means."
-    figures["curves"].append(written("curves.png", curves_figure(histories, starts), caption, "chart"))
+    add("curves", "curves.png", curves_figure(histories, starts), caption, "chart")
     if model.textures is not None and (model.textures.sizes.prod(axis=1) > 1).any():
         sheet = learned_textures(model)
         if sheet is not None:
             caption = "Some of the most visible textures, in their Gaussians' colours; chequered where transparent."
-            figures["textures"].append(written("textures.png", sheet, caption, "texels"))
+            add("textures", "textures.png", sheet, caption, "texels")
         caption = "Number of Gaussians with a texture of each resolution."
-        figures["textures"].append(written("sizes.png", sizes_figure(model.textures.sizes), caption, "chart"))
+        add("textures", "sizes.png", sizes_figure(model.textures.sizes), caption, "chart")
     for name, varying, levels, meanings in level_maps(model):
         legend = list(zip(map(to_hex, level_colors(len(meanings))), meanings, strict=True))
         caption = f"The first view, every Gaussian by {varying}; {NOT_HIT}."
-        picture = level_picture(model, levels, camera, settings)
-        figures["maps"].append(written(name, picture, caption, legend=legend))
+        add("maps", name, level_picture(model, levels, camera, settings), caption, legend=legend)
     output = Renderer(model, settings=settings)(camera)
     picture, stops = depth_picture(output)
     legend = [(to_hex(tuple(color)), f"{distance:.3g}") for distance, color in stops]
     caption = "Depth in units of the normalised world; nearer and farther depths have the colours of the ends"
-    figures["geometry"].append(written("depth.png", picture, f"{caption}; {NOT_HIT}.", legend=legend))
+    add("geometry", "depth.png", picture, f"{caption}; {NOT_HIT}.", legend=legend)
     caption = f"Normals: red to the right, green up, blue to the camera; {NOT_HIT}."
-    figures["geometry"].append(written("normals.png", normal_picture(output, camera), caption))
+    add("geometry", "normals.png", normal_picture(output, camera), caption)
     return figures
 
 

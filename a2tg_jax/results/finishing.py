@@ -5,6 +5,7 @@ import dataclasses
 import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 from a2tg_jax import Model, Scene, evaluate, load_model, save_model
 from a2tg_jax.base.atomic import replacing
@@ -27,11 +28,10 @@ MOST_VIEWS = 16
 """Largest number of training views for measuring the loss of shrinking, evenly chosen."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Measured:
-    """Bytes and PSNR of a model."""
+class Measured(NamedTuple):
+    """A model and its PSNR."""
 
-    num_bytes: int
+    model: Model
     train: float
     """PSNR of the training views in dB."""
     test: float | None
@@ -71,13 +71,11 @@ def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_we
     num_steps = 2 + 2 * (shrinks + polishes)
     with claimed(run), counting("finish", num_steps, "step") as counter:
         is_written = _is_written(run, content)  # Another process may have been here meanwhile.
-        models = {"before": model}
         steps = {"before": _measured(model, scene, planned)}
         counter.update()
         changed = iter([("finished", load_model(run.model(name)))]) if is_written else _changed(model, scene, options)
         for step, after in changed:
             counter.update()
-            models[step] = after
             steps[step] = _measured(after, scene, planned)
             counter.update()
         if not is_written:
@@ -85,7 +83,7 @@ def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_we
             run.clear()
             write_json(run.own(run.finish), content)
             _copy_other_models(source, run, record)
-            kept = models[kept_step(steps)]
+            kept = steps[kept_step(steps)].model
             save_model(run.own(run.model(name)), kept, {"system": system_to_dict(planned.system)})
             write_record(run, record)  # Last: it makes the folder a run.
         evaluate_run(run, scene, lpips_weights=lpips_weights)
@@ -107,7 +105,7 @@ def _table(steps: Mapping[str, Measured]) -> str:
     columns = [("", "bytes", "train PSNR (dB)", "held-out PSNR (dB)")]
     for name, measured in steps.items():
         test = "" if measured.test is None else f"{measured.test:.2f}"
-        columns.append((name, f"{measured.num_bytes:,}", f"{measured.train:.2f}", test))
+        columns.append((name, f"{measured.model.num_bytes:,}", f"{measured.train:.2f}", test))
     lines = aligned(columns)
     kept = kept_step(steps)
     if kept != list(steps)[-1]:
@@ -147,4 +145,4 @@ def kept_step(steps: Mapping[str, Measured]) -> str:
 def _measured(model: Model, scene: Scene, planned: PlannedStage) -> Measured:
     settings = settings_of(planned.system)
     test = evaluate(scene.test, model, settings=settings).psnr if scene.test else None
-    return Measured(model.num_bytes, evaluate(scene.train, model, settings=settings).psnr, test)
+    return Measured(model, evaluate(scene.train, model, settings=settings).psnr, test)

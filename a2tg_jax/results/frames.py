@@ -235,7 +235,7 @@ def _cameras(model: Model, route: CameraPath | Path, num_frames: int) -> dict[st
 
 
 def unseen_angle(origin: Origin) -> float:
-    """Return the largest angle around the subject, in radians, without a camera."""
+    """Return the largest angle around the subject, in radians, without a camera (`largest_gap`)."""
     return largest_gap(matrices_of(without_outlying(list(origin.cameras))), origin.vertical)
 
 

@@ -35,14 +35,15 @@ def write_history(path: Path, history: History) -> None:
 def read_history(path: Path) -> History:
     """Return the history in a file. Raises FileNotFoundError if there is none, and ValueError, naming the file, if it
     has other columns, or values that are not numbers. Only PSNR may be infinite, and only loss terms NaN."""
+    again = f"delete models/{path.stem}.npz to train the stage again by a2tg train --resume"
     if not is_regular(path):
-        raise FileNotFoundError(f"{path} is missing: put it back, or train the stage again")
+        raise FileNotFoundError(f"{path} is missing: put it back, or {again}")
     with io.TextIOWrapper(open_regular(path, MOST_BYTES), encoding="utf-8", newline="") as file:
         try:
             names = file.readline().rstrip("\r\n").split(",")
             columns = _read_columns(file, names)
         except ValueError as error:
-            raise ValueError(f"{path}: {shortened(str(error), 200)}; train the stage again") from error
+            raise ValueError(f"{path}: {shortened(str(error), 200)}; {again}") from error
     for name in INTEGERS:
         columns[name] = columns[name].astype(np.int64)
     return History.of_columns(columns)

@@ -120,13 +120,13 @@ def picture_names(view_names: Iterable[str]) -> dict[str, str]:
     return names
 
 
-def save_picture(path: str | os.PathLike[str], picture: Image.Image | np.ndarray) -> None:
+def save_picture(path: Path, picture: Image.Image | np.ndarray) -> None:
     """Write a PNG atomically."""
     with replacing(path) as temporary:
         write_png(temporary, picture)
 
 
-def write_png(path: str | os.PathLike[str], picture: Image.Image | np.ndarray) -> None:
+def write_png(path: Path, picture: Image.Image | np.ndarray) -> None:
     picture = Image.fromarray(picture) if isinstance(picture, np.ndarray) else picture
     text = PngInfo()
     text.add_text("Software", PROGRAM)  # `data.photo_folder` takes no such picture for a photograph.

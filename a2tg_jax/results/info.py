@@ -11,7 +11,7 @@ import numpy as np
 from a2tg_jax import Model, load_checkpoint, load_model
 from a2tg_jax.base.json_text import read_json
 from a2tg_jax.base.regular_files import is_regular
-from a2tg_jax.base.text import in_bytes
+from a2tg_jax.base.text import counted, in_bytes
 from a2tg_jax.io.formats import file_bytes, format_of, load_splats
 from a2tg_jax.results.commands import repeating_command, resuming_command
 from a2tg_jax.results.folder import RunFolder, iteration_of, old_run
@@ -223,7 +223,7 @@ def _shortened(stage: Mapping[str, Any]) -> str:
 
 def _counts_text(facts: Mapping[str, Any]) -> str:
     """Return the numbers of `model_facts` as text."""
-    parts = [f"{facts['num_gaussians']:,} Gaussians", in_bytes(facts["num_bytes"])]
+    parts = [counted(facts["num_gaussians"], "Gaussian"), in_bytes(facts["num_bytes"])]
     if facts.get("degrees"):
         parts.append("degrees " + ", ".join(f"{degree}: {num:,}" for degree, num in enumerate(facts["degrees"])))
     if facts.get("textures"):

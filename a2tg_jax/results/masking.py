@@ -15,7 +15,7 @@ from a2tg_jax.host.progress_bars import progress_over
 from a2tg_jax.io.edit_file import Edit, kept_by, load_edit
 from a2tg_jax.io.subject import find_subject
 from a2tg_jax.render import with_features
-from a2tg_jax.results.commands import beside, training_command
+from a2tg_jax.results.commands import next_to, training_command
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.images import save_picture
 from a2tg_jax.results.model_source import open_source
@@ -83,7 +83,7 @@ def write_masks(
         save_picture(file, np.uint8(255) * is_white)
         covered.append(100 * is_white.mean())
     what = "what the edit keeps" if subject is None else f"the subject ({subject.words})"
-    train = training_command(run, beside(run, "subject"), "--mask-as", "background")
+    train = training_command(run, next_to(run, "subject"), "--mask-as", "background")
     return (
         f"wrote {counted(len(files), 'mask')} to {out}/: {what} covers {np.mean(covered):.0f} % of the photographs, "
         f"{min(covered):.0f} to {max(covered):.0f} % of each\n"

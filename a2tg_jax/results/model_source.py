@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from a2tg_jax import (
+    Checkpoint,
     History,
     Model,
     RenderSettings,
@@ -114,22 +115,27 @@ def chosen_stage(run: RunFolder, plan: RunPlan, name: str | None = None) -> tupl
 
 def trained_model(run: RunFolder, planned: PlannedStage, load_scene: Callable[[], Scene | None]) -> Model:
     """Return the model of a stage of which something was kept. A checkpoint has no cameras, so that the scene is read.
-    If the newest checkpoint is damaged, an older one is taken, with a warning. Raises FileNotFoundError if the scene is
-    missing, and ValueError if no file can be read."""
+    Raises FileNotFoundError if the scene is missing, and ValueError if no file can be read."""
     if is_regular(run.model(planned.name)):
         return load_model(run.model(planned.name))
-    *older, newest = run.checkpoints(planned.name)
     scene = load_scene()
     if scene is None:
+        newest = run.checkpoints(planned.name)[-1]
         raise FileNotFoundError(f"{newest} has no cameras, and the scene that has them is missing")
+    return readable_checkpoint(run, planned)[1].model_in(scene)
+
+
+def readable_checkpoint(run: RunFolder, planned: PlannedStage) -> tuple[Path, Checkpoint]:
+    """Return the newest checkpoint of a stage, and its file. If it is damaged, the one before is taken, with a warning.
+    Raises ValueError if neither can be read."""
+    *older, newest = run.checkpoints(planned.name)
     try:
-        checkpoint = load_checkpoint(newest, system=type(planned.system))
+        return newest, load_checkpoint(newest, system=type(planned.system))
     except ValueError as error:
         if not older:
             raise
         warnings.warn(f"{error}; {older[-1].name} is taken instead", stacklevel=2)
-        checkpoint = load_checkpoint(older[-1], system=type(planned.system))
-    return checkpoint.model_in(scene)
+        return older[-1], load_checkpoint(older[-1], system=type(planned.system))
 
 
 def open_source(path: Path, name: str | None = None, edit: Path | None = None) -> Source:

@@ -47,7 +47,9 @@ def check_apart(out: Path, other: Path) -> None:
 
 def check_new(path: Path, option: str, *, overwrite: bool) -> None:
     """Raise if a file must not be replaced, naming it and its option: FileExistsError if it exists and `overwrite` is
-    not set, ValueError if it belongs to a run and is no export."""
+    not set, ValueError if it belongs to a run and is no export, or is a folder."""
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder; give the path of a file, or choose another {option}")
     if not path.is_file():
         return
     run = _run_that_wrote(path)

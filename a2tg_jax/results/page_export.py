@@ -108,7 +108,7 @@ def _scene_lines(source: Source) -> list[str]:
     model = source.model
     size = len(source.encoded)
     ratio = f"1/{model.num_bytes / max(size, 1):.1f} of the model's {in_bytes(model.num_bytes)}"
-    lines = [f"{model.num:,} Gaussians, whose scene takes {in_bytes(size)}, {ratio}"]
+    lines = [f"{counted(model.num, 'Gaussian')}, whose scene takes {in_bytes(size)}, {ratio}"]
     if model.num:
         # The page's near plane.
         settings = dataclasses.replace(source.settings, near_plane=source.near_plane)
@@ -125,7 +125,7 @@ def export_comparison(sources: Sequence[Source], out: Path, *, overwrite: bool =
       FileExistsError: if the file exists.
       ValueError: if it does not end in .html, or the models are not in one world.
     """
-    if out.suffix.lower() != ".html" or out.is_dir():
+    if out.suffix.lower() != ".html":
         raise ValueError(f"`out` must be the path of a file that ends in .html; got {out}")
     check_new(out, "`out`", overwrite=overwrite)
     first, second = sources

@@ -21,7 +21,7 @@ from a2tg_jax.base.json_text import MOST_TOML_BYTES
 from a2tg_jax.base.regular_files import is_regular, read_regular
 from a2tg_jax.base.text import in_bytes
 from a2tg_jax.host.source_commit import source_commit
-from a2tg_jax.results.commands import beside, repeating_command, training_command
+from a2tg_jax.results.commands import next_to, repeating_command, training_command
 from a2tg_jax.results.figures import ReportFigure
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.images import file_uri, jpeg_uri
@@ -397,7 +397,7 @@ def write_report(
         versions=versions(),
         commit=source_commit(),
         command=repeating_command(run),
-        final=training_command(run, beside(run, "final"), "--test-every", "0") if is_split_by_number else None,
+        final=training_command(run, next_to(run, "final"), "--test-every", "0") if is_split_by_number else None,
         record=read_regular(run.record, MOST_TOML_BYTES).decode() if is_regular(run.record) else "",
     )
     write_whole(run.own(run.report), page)

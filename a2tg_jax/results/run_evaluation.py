@@ -17,7 +17,6 @@ import numpy as np
 
 from a2tg_jax import (
     Evaluation,
-    History,
     Model,
     Origin,
     Renderer,
@@ -26,8 +25,8 @@ from a2tg_jax import (
     View,
     align_poses,
     evaluate,
-    load_checkpoint,
     load_lpips,
+    load_model,
     view_image,
 )
 from a2tg_jax.base.atomic import write_whole
@@ -50,8 +49,8 @@ from a2tg_jax.results.images import (
     side_by_side,
     to_uint8,
 )
-from a2tg_jax.results.model_source import chosen_stage, settings_of, trained_model
-from a2tg_jax.results.plan import PlannedStage, RunPlan
+from a2tg_jax.results.model_source import chosen_stage, readable_checkpoint, settings_of
+from a2tg_jax.results.plan import RunPlan
 from a2tg_jax.results.record import is_finished, read_record
 from a2tg_jax.results.report import Comparison, ModelResult, RunResult, metrics_json, per_view_json, write_report
 from a2tg_jax.results.stage_training import check_held_out
@@ -72,13 +71,19 @@ def evaluate_run(run: RunFolder, scene: Scene | None = None, *, lpips_weights: P
     record = read_record(run)
     plan = record.plan
     planned, note = chosen_stage(run, plan)
-    names = finished_stages(run, plan) or [planned.name]
+    finished = finished_stages(run, plan)
     scene = scene or record.scene.load()
-    models = {name: trained_model(run, plan[name], lambda: scene) for name in names}
+    files = {name: run.model(name) for name in finished}
+    models = {name: load_model(files[name]) for name in finished}
+    histories = {}
+    if not finished:
+        files[planned.name], checkpoint = readable_checkpoint(run, planned)
+        models[planned.name] = checkpoint.model_in(scene)
+        histories[planned.name] = checkpoint.history
     # Before minutes of measuring.
     for name, model in models.items():
-        check_held_out(model, scene, run.model(name))
-    histories = {name: trained_history(run, plan[name]) for name in names}
+        check_held_out(model, scene, files[name])
+    histories |= {name: read_history(run.history(name)) for name in finished}
     results = {}
     for name, model in models.items():
         results[name] = ModelResult(
@@ -89,7 +94,7 @@ def evaluate_run(run: RunFolder, scene: Scene | None = None, *, lpips_weights: P
             num_published_bytes=model.num_published_bytes,
             num_padding_bytes=model.num_padding_bytes,
             seconds=histories[name].last_seconds,
-            sha256=sha256_of(run.newest(name) or run.model(name)),
+            sha256=sha256_of(files[name]),
         )
     if lpips_weights is None:
         results = _with_kept_lpips(run, results)
@@ -114,13 +119,6 @@ def evaluate_run(run: RunFolder, scene: Scene | None = None, *, lpips_weights: P
     if is_finished(run, record):
         drop_old(run)
     return result
-
-
-def trained_history(run: RunFolder, planned: PlannedStage) -> History:
-    """Return the history of a stage that is finished, or of its newest checkpoint."""
-    if run.model(planned.name).is_file():
-        return read_history(run.history(planned.name))
-    return load_checkpoint(run.checkpoints(planned.name)[-1], system=type(planned.system)).history
 
 
 def is_split_by_number(source: SceneSource, scene: Scene) -> bool:

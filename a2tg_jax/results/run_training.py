@@ -58,7 +58,7 @@ def unseen(scene: Scene) -> AbstractContextManager[Callable[..., float]]:
     return contextlib.nullcontext(lambda run, is_stopped: 0.0)
 
 
-def warn(doubts: Sequence[str]) -> None:
+def warn_of_doubts(doubts: Sequence[str]) -> None:
     """Warn of each doubt."""
     for doubt in doubts:
         warnings.warn(doubt, stacklevel=3)
@@ -81,7 +81,7 @@ class RunOptions:
     watched: Watched = unseen
     on_note: Callable[[str], object] = lambda line: None
     """Function that receives lines about the run."""
-    confirm: Callable[[Sequence[str]], None] = warn
+    confirm: Callable[[Sequence[str]], None] = warn_of_doubts
     """Function called with the doubts about a new run (`doubts_about`), if there are any; it may raise ValueError."""
     session: Session = dataclasses.field(default_factory=Session)
 

@@ -145,13 +145,14 @@ class LiveView:
     @property
     def routes(self) -> dict[str, Route]:
         """Routes of the viewer's server."""
+        status = Route("application/json", self._status_json)
         return {
             "/": Route("text/html; charset=utf-8", viewer_html(is_training=True).encode()),
             f"/{SCENE_NAME}": Route("application/octet-stream", lambda: self._scene_bytes),
-            f"/{STATUS_NAME}": Route("application/json", self._status_json),
-            "/pause": Route("application/json", self._status_json, act=self._paused.set),
-            "/resume": Route("application/json", self._status_json, act=self._paused.clear),
-            "/finish": Route("application/json", self._status_json, act=self._finish),
+            f"/{STATUS_NAME}": status,
+            "/pause": dataclasses.replace(status, act=self._paused.set),
+            "/resume": dataclasses.replace(status, act=self._paused.clear),
+            "/finish": dataclasses.replace(status, act=self._finish),
             **CameraPhotographs(self._scene.origin, lambda: self._scene).routes,
         }
 

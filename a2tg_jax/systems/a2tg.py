@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Self
 
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.appearance import Appearance, TexelRates, Texture, TextureOptions
-from a2tg_jax.base.checks import check_number
+from a2tg_jax.base.checks import check_fields, check_number
 from a2tg_jax.base.text import MEGABYTE, megabytes_of
 from a2tg_jax.core.budget import bytes_per_gaussian
 from a2tg_jax.core.gaussians import floats_per_gaussian
@@ -121,13 +121,8 @@ class A2tg(TwoStages):
 
     def check_options(self) -> None:
         super().check_options()
-        check_number("texel_rate", self.texel_rate, least=0)
-        if self.single_texel_rate is not None:
-            check_number("single_texel_rate", self.single_texel_rate, least=0)
-        if self.texture_share is not None:
-            check_number("texture_share", self.texture_share, least=0, below=1)
-        if self.kernel_rate is not None:
-            check_number("kernel_rate", self.kernel_rate, least=0)
+        check_fields(self, "texel_rate", "single_texel_rate", "kernel_rate", least=0)
+        check_fields(self, "texture_share", least=0, below=1)
         if self.empty_textures:
             check_number("texture.cap", self.texture.cap, least=2)
             # A rate of 0, as in short presets, holds nothing still.

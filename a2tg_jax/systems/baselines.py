@@ -11,7 +11,7 @@ from typing import ClassVar, Self
 
 from a2tg_jax.appearance import Appearance, Billboards, MovableKernels, Texture, TextureOptions
 from a2tg_jax.appearance.movable_kernels import FLOATS_PER_KERNEL, NUM_KERNELS
-from a2tg_jax.base.checks import check_number
+from a2tg_jax.base.checks import check_fields
 from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.densify.clone_split import CloneSplitPrune, OpacityReset
 from a2tg_jax.densify.pruning import Prune
@@ -127,8 +127,8 @@ class TexturedGaussians(TwoStages):
 
     def check_options(self) -> None:
         super().check_options()
-        check_number("texture_side", self.texture_side, least=1, most=16)
-        check_number("texel_rate", self.texel_rate, least=0)
+        check_fields(self, "texture_side", least=1, most=16)
+        check_fields(self, "texel_rate", least=0)
 
 
 AUTHORS_LOG_SCALES = 3e-3
@@ -150,8 +150,7 @@ class KernelRates(NamedFields):
 
     def check_options(self) -> None:
         """Raise ValueError, beginning with the name of the field, if a rate is negative."""
-        for field in dataclasses.fields(self):
-            check_number(field.name, getattr(self, field.name), least=0)
+        check_fields(self, least=0)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -198,9 +197,8 @@ class BillboardOptions(NamedFields):
 
     def check_options(self) -> None:
         """Raise ValueError, beginning with the name of the field, if a number is out of range."""
-        check_number("side", self.side, least=2, most=16)
-        check_number("rgb", self.rgb, least=0)
-        check_number("alpha", self.alpha, least=0)
+        check_fields(self, "side", least=2, most=16)
+        check_fields(self, "rgb", "alpha", least=0)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -6,7 +6,7 @@ from typing import ClassVar, Self
 
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.appearance import Appearance, Bands, TexelRates, Texture, TextureOptions
-from a2tg_jax.base.checks import check_number
+from a2tg_jax.base.checks import check_fields, check_number
 from a2tg_jax.base.text import MEGABYTE, bytes_of, shortened
 from a2tg_jax.core.budget import bytes_per_gaussian
 from a2tg_jax.densify.placing import PlaceByError
@@ -144,11 +144,9 @@ class Bytewise(TwoStages):
 
     def check_options(self) -> None:
         super().check_options()
-        check_number("base_degree", self.base_degree, least=0, most=self.sh_degree)
-        for name in ("view_dependence_share", "texture_share"):
-            check_number(name, getattr(self, name), least=0, most=1)
-        for name in ("fading_weight", "kernel_rate", "view_dependence_rate", "texel_rate"):
-            check_number(name, getattr(self, name), least=0)
+        check_fields(self, "base_degree", least=0, most=self.sh_degree)
+        check_fields(self, "view_dependence_share", "texture_share", least=0, most=1)
+        check_fields(self, "fading_weight", "kernel_rate", "view_dependence_rate", "texel_rate", least=0)
         self._check_decided()
         self._check_shares()
         self._check_times()

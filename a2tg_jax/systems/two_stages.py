@@ -1,24 +1,25 @@
 """What the systems of this library share: a first stage that grows, a second one with a fixed number of Gaussians."""
 
 import dataclasses
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self, TypeVar
 
 import jax.numpy as jnp
 
 from a2tg_jax.appearance import Appearance, Exponents
 from a2tg_jax.appearance.parts import shapes_of
-from a2tg_jax.base.checks import check_number
+from a2tg_jax.base.checks import check_fields
 from a2tg_jax.base.text import shortened
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree
 from a2tg_jax.densify.clone_split import CloneSplitPrune, FillingDensity
-from a2tg_jax.densify.pruning import Prune, PruneFloaters, during_growth
+from a2tg_jax.densify.pruning import Prune, PruneFloaters
 from a2tg_jax.events import Change, Event, Now, StepEvent, Times
 from a2tg_jax.mcmc import FillingMcmc, Mcmc, Noise
 from a2tg_jax.model import Model
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import LearningRates, Stage
 
+P = TypeVar("P", Prune, PruneFloaters)
 QUICK_CAP = 10_000
 QUICK_OPACITY = 0.5
 QUICK_RATES = LearningRates(means=3 * 1.6e-4, sh_degree0=2 * 2.5e-3)
@@ -55,7 +56,7 @@ class TwoStages(System):
 
     def check_options(self) -> None:
         super().check_options()
-        check_number("coarse_share", self.coarse_share, least=0, most=1)
+        check_fields(self, "coarse_share", least=0, most=1)
 
     @classmethod
     def short_presets(cls, quick: dict[str, Any], smoke: dict[str, Any]) -> dict[str, Self]:
@@ -77,13 +78,7 @@ class TwoStages(System):
             growths = [times for times in growths if times]
             if growths:
                 latest = max(growths, key=lambda times: times[-1])
-                floaters = dataclasses.replace(floaters, at=during_growth(floaters.at, length, latest))
-                if not floaters.at:
-                    raise ValueError(
-                        "floaters.at must hold a fraction before the last growth, which is at iteration "
-                        f"{latest[-1]:,} of {length:,}, so that others replace what is pruned; got "
-                        f"{shortened(self.floaters.at)}"
-                    )
+                floaters = _before_last_growth(floaters, "floaters", length, latest)
             events = (*events, floaters)
         return Stage(
             name, appearance, events, self.loss.terms(), self.rates, length, appearance_rate, self.corrections_of(0),
@@ -116,7 +111,7 @@ class LimitExponents(StepEvent):
     num_keys = 0
 
     def check_options(self) -> None:
-        check_number("least", self.least, least=0, most=1)
+        check_fields(self, "least", least=0, most=1)
 
     def apply(self, now: Now, model: Model, moments: AdamState, state: tuple[()]) -> Change:
         shapes = model.appearance.shapes
@@ -164,7 +159,7 @@ def grown_by_density(densify: CloneSplitPrune, budget_cap: int | None) -> CloneS
 
 
 def pruned(prune: Prune, num_iterations: int, growth: Times) -> tuple[Event, ...]:
-    """Return the event that prunes while others grow; none if its share is 0.
+    """Return the event that prunes while others grow; none if its share is 0 or nothing grows.
 
     `growth` is the times of growth in a stage of that length.
 
@@ -178,10 +173,15 @@ def pruned(prune: Prune, num_iterations: int, growth: Times) -> tuple[Event, ...
             f"prune.at must hold fractions up to {LAST_PRUNING}, after which too little replaces what is pruned; got "
             f"{shortened(prune.at)}: lower the last, or set prune.share to 0"
         )
-    at = during_growth(prune.at, num_iterations, growth)
-    if not at and growth:
+    return (_before_last_growth(prune, "prune", num_iterations, growth),) if growth else ()
+
+
+def _before_last_growth(event: P, name: str, num_iterations: int, growth: Times) -> P:
+    """Return an event that prunes at its fractions of a stage before the last growth. ValueError: there are none."""
+    at = tuple(fraction for fraction in event.at if round(fraction * num_iterations) < growth[-1])
+    if not at:
         raise ValueError(
-            f"prune.at must hold a fraction before the last growth, which is at iteration {growth[-1]:,} of "
-            f"{num_iterations:,}; got {shortened(prune.at)}: lower the first, or set prune.share to 0"
+            f"{name}.at must hold a fraction before the last growth, which is at iteration {growth[-1]:,} of "
+            f"{num_iterations:,}; got {shortened(event.at)}: lower the first, because others replace what is pruned"
         )
-    return (dataclasses.replace(prune, at=at),) if at else ()
+    return dataclasses.replace(event, at=at)

@@ -217,8 +217,7 @@ class PhotoStore:
                 self._places[index] = len(alike)
                 alike.append(index)
             for kind, alike in of_kind.items():
-                stack = self._read(alike)
-                self._stacks[kind] = self._placed(kind, stack)
+                self._stacks[kind] = self._placed(kind, self._read(alike))
         self._here = views_here(mesh, len(order.indices(1)))
         """Places in a batch of the views that this process draws."""
 
@@ -248,15 +247,12 @@ class PhotoStore:
         all lenses fit."""
         rays = self._rays.get(kind, batch.rays)
         if rays is not None and kind not in self._rays:
-            rays = self._everywhere(rays)
+            rays = everywhere(self._mesh, rays)
             if self._keeps_rays:
                 self._rays[kind] = rays
         batch = batch._replace(rays=None)
-        placed = self._everywhere(batch) if self.is_resident else of_views(self._mesh, batch)
+        placed = everywhere(self._mesh, batch) if self.is_resident else of_views(self._mesh, batch)
         return placed._replace(rays=rays)
-
-    def _everywhere(self, tree: Any) -> Any:
-        return jax.device_put(tree) if self._mesh is None else everywhere(self._mesh, tree)
 
     def _read(self, indices: Sequence[int]) -> Photographs:
         return stack_views([self._views[index] for index in indices], self._views, has_depths=self._has_depths)

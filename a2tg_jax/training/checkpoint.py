@@ -17,7 +17,7 @@ from a2tg_jax.base.checks import check_count, check_finite, check_like
 from a2tg_jax.base.config_json import config_from_dict, config_to_dict, flatten_config
 from a2tg_jax.base.machine import ALONE, Devices, Machine, this_machine
 from a2tg_jax.base.named_fields import NamedFields
-from a2tg_jax.base.regular_files import reading
+from a2tg_jax.base.regular_files import expanded, reading
 from a2tg_jax.base.text import counted, shortened
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.optim import AdamState
@@ -135,7 +135,7 @@ def save_checkpoint(path: str | os.PathLike[str], checkpoint: Checkpoint) -> Non
     rest = _rest(state), dataclasses.asdict(checkpoint.history)
     for place, leaf in jax.tree_util.tree_leaves_with_path((model.gaussians, rest)):
         arrays[jax.tree_util.keystr(place)] = np.asarray(leaf)
-    write_archive(path, header, arrays)
+    write_archive(expanded(path), header, arrays)
 
 
 def load_checkpoint(path: str | os.PathLike[str], system: type[System] | None = None) -> Checkpoint:
@@ -152,6 +152,7 @@ def load_checkpoint(path: str | os.PathLike[str], system: type[System] | None = 
       FileNotFoundError: if there is no such file.
       ValueError: if it is no checkpoint, is damaged, is of another version, or its system is unknown.
     """
+    path = expanded(path)
     header, arrays = read_archive(path)
     with reading(path):
         return _checkpoint_of(header, arrays, system_from_dict(header["system"], str(path), system))
@@ -250,15 +251,13 @@ def check_state(state: TrainState, expected: TrainState, stage: Stage) -> None:
     check_model(state.model)
     check_count("state.iteration", state.iteration, stage.iterations)
     check_count("state.status", state.status, EXPLODED)
-    check_count("state.moments.count", state.moments.count, np.iinfo(np.int32).max)
-    check_finite("state.moments.mu", state.moments.mu)
-    check_finite("state.moments.nu", state.moments.nu, is_signed=False)
+    for name, moments in (("", state.moments), *((".corrections", each.moments) for each in state.corrections)):
+        check_finite(f"state{name}.moments.mu", moments.mu)
+        check_finite(f"state{name}.moments.nu", moments.nu, is_signed=False)
+        if (np.asarray(moments.count) < 0).any():
+            raise ValueError(f"state{name}.moments.count must be at least 0; some are below")
     for correction in state.corrections:
         check_finite("state.corrections.rows", correction.rows)
-        check_finite("state.corrections.mu", correction.moments.mu)
-        check_finite("state.corrections.nu", correction.moments.nu, is_signed=False)
-        if (np.asarray(correction.moments.count) < 0).any():
-            raise ValueError("state.corrections.count must be at least 0; some are below")
     for path, leaf in jax.tree_util.tree_leaves_with_path(state.events):
         if np.isnan(np.asarray(leaf)).any():
             raise ValueError(f"state.events{jax.tree_util.keystr(path)} must be numbers; some are NaN")

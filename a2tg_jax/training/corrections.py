@@ -6,6 +6,7 @@ dataclass that is a pytree of its numbers. V views.
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
@@ -14,9 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.base.checks import check_number
+from a2tg_jax.base.checks import check_fields
 from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.core.cameras import Camera, moved_viewmat
+from a2tg_jax.core.numerics import where_rows
 from a2tg_jax.core.optim import AdamState, adam_init, adam_update
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.pytree import pytree, static
@@ -71,8 +73,8 @@ class FadingCorrection(Correction):
     """Whether the rows are kept neutral on average over the views."""
 
     def check_options(self) -> None:
-        check_number("rate", self.rate, least=0)
-        check_number("final_factor", self.final_factor, above=0)  # The decay is exponential.
+        check_fields(self, "rate", least=0)
+        check_fields(self, "final_factor", above=0)  # The decay is exponential.
 
     def learning_rate(self, progress: Array) -> Array:
         return self.rate * self.final_factor**progress
@@ -235,9 +237,8 @@ def updated(
 
     # Adam would also move the rows of other views, by their moments.
     rows, moments = jax.tree.map(
-        lambda new, old: jnp.where(is_seen.reshape(-1, *[1] * (new.ndim - 1)), new, old),
-        (step.params, step.state), (state.rows, state.moments),
-    )  # fmt: skip
+        functools.partial(where_rows, is_seen), (step.params, step.state), (state.rows, state.moments)
+    )
     projected = correction.project(rows)
     check_kept(f"{type(correction).__name__}.project", projected, rows)
     return CorrectionState(projected, moments)
@@ -297,7 +298,7 @@ class BilateralGrid(FadingCorrection):
         super().check_options()
         if not all(1 <= number <= LARGEST_GRID for number in self.size):
             raise ValueError(f"size must be numbers in 1..{LARGEST_GRID}; got {self.size}")
-        check_number("smoothness", self.smoothness, least=0)
+        check_fields(self, "smoothness", least=0)
 
     @property
     def neutral(self) -> np.ndarray:

@@ -35,7 +35,7 @@ def largest_loss(history: History) -> float:
 def what_diverged(tried: Attempt, names: Sequence[str]) -> str:
     """Return the views and parameters whose numbers are not finite, or the loss if all of them are finite, given the
     step that could not be taken, in NumPy arrays, and the names of its views."""
-    losses = np.asarray(tried.views.loss)
+    losses = np.asarray(tried.views.value)
     lost = [f"the loss of {name} is {loss}" for name, loss in zip(names, losses, strict=True) if not np.isfinite(loss)]
     lost += [f"the gradient by {place}" for place in _not_finite(tried.grads)]
     model = tried.state.model

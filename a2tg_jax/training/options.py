@@ -5,7 +5,7 @@ import math
 import typing
 from typing import Any, ClassVar, Literal, Self
 
-from a2tg_jax.base.checks import check_int, check_number, fields_of
+from a2tg_jax.base.checks import check_fields, check_groups, check_int, check_number
 from a2tg_jax.base.config_json import changed_config, check_config, config_to_dict, flatten_config
 from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.text import budget_in_bytes, did_you_mean, in_bytes, megabytes_of, shortened
@@ -56,11 +56,9 @@ class LossConfig(NamedFields):
 
     def check_options(self) -> None:
         """Raise ValueError, beginning with the name of the field, if a number is out of range."""
-        for field in dataclasses.fields(self):
-            if field.name != "depth_kind":
-                check_number(field.name, getattr(self, field.name), least=0)
-        check_number("ssim_weight", self.ssim_weight, most=1)
-        check_number("robust_share", self.robust_share, most=1)
+        names = [field.name for field in dataclasses.fields(self) if field.name != "depth_kind"]
+        check_fields(self, *names, least=0)
+        check_fields(self, "ssim_weight", "robust_share", most=1)
 
     def terms(self, is_first: bool = True) -> tuple[LossTerm, ...]:
         """Return the loss terms whose weight is not 0.
@@ -99,9 +97,7 @@ class Corrections(NamedFields):
 
     def check_options(self) -> None:
         """Raise ValueError, beginning with the path of the field, if a number is out of range."""
-        for name in ("affine", "grid", "pose"):
-            with fields_of(name):
-                getattr(self, name).check_options()
+        check_groups(self)
 
 
 FEW_GAUSSIANS = 1_000
@@ -317,18 +313,13 @@ class System(NamedFields):
             if not all(math.isfinite(number) for number in values if isinstance(number, float)):
                 wanted = "finite numbers" if isinstance(value, tuple) else "a finite number"
                 raise ValueError(f"{name} must be {wanted}; got {shortened(value)}")
-        for field in dataclasses.fields(self):
-            check = getattr(getattr(self, field.name), "check_options", None)
-            if check is not None:
-                with fields_of(field.name):
-                    check()
-        check_number("batch_size", self.batch_size, least=1)
-        if self.initial_gaussians is not None:
-            check_number("initial_gaussians", self.initial_gaussians, least=2)
-        check_number("initial_opacity", self.initial_opacity, above=0, below=1)
-        check_number("sh_degree", self.sh_degree, least=0, most=3)
+        check_groups(self)
+        check_fields(self, "batch_size", least=1)
+        check_fields(self, "initial_gaussians", least=2)
+        check_fields(self, "initial_opacity", above=0, below=1)
+        check_fields(self, "sh_degree", least=0, most=3)
         check_int("seed", self.seed, 0, 2**31 - 1)
-        check_number("tile_size", self.tile_size, least=1, most=MAX_TILE_SIZE)
+        check_fields(self, "tile_size", least=1, most=MAX_TILE_SIZE)
         for iterations in self.more:
             check_number("more", iterations, least=1)
 
@@ -364,14 +355,15 @@ class System(NamedFields):
     def path_of(self, event: Event) -> str:
         """Return the path of the option that an event of a stage was made from, such as "densify"; the name of the
         event's class if there is none."""
-        groups = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        names = (name for name, group in groups.items() if isinstance(group, Event) and isinstance(event, type(group)))
-        return next(names, type(event).__name__)
+        for field in dataclasses.fields(self):
+            group = getattr(self, field.name)
+            if isinstance(group, Event) and isinstance(event, type(group)):
+                return field.name
+        return type(event).__name__
 
     def more_growth(self) -> str:
         """Return the names of the options to raise for more Gaussians, for advice."""
-        names = [field.name for field in dataclasses.fields(self)]
-        return " or ".join(name for name in ("stage1_iterations", "initial_gaussians") if name in names)
+        return " or ".join(name for name in ("stage1_iterations", "initial_gaussians") if hasattr(self, name))
 
     def caps(self) -> tuple[str, ...]:
         """Return the paths of the options that limit the number of Gaussians without a memory budget."""

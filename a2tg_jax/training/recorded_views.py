@@ -12,6 +12,8 @@ from a2tg_jax.scene import View
 
 UNKNOWN = -1
 """Checksum of pixels that were not read, or of a missing mask."""
+SHAPES: dict[str, tuple[int, ...]] = {"viewmats": (4, 4), "Ks": (3, 3), "sizes": (2,), "pixels": (), "masks": ()}
+"""Shape of a view in each array of the records."""
 CAMERA_TOLERANCE = 1e-4
 """Difference of cameras by which two machines may disagree."""
 
@@ -49,19 +51,18 @@ class RecordedViews:
     @property
     def arrays(self) -> dict[str, np.ndarray]:
         """The arrays by name."""
-        return {name: getattr(self, name) for name in ("viewmats", "Ks", "sizes", "pixels", "masks")}
+        return {name: getattr(self, name) for name in SHAPES}
 
     @staticmethod
     def of_arrays(names: object, arrays: Mapping[str, np.ndarray]) -> "RecordedViews":
         """Return the record of names and `arrays` from a file. ValueError: they do not fit each other."""
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise ValueError(f"views must be a list of names; got {shortened(names)}")
-        shapes = {"viewmats": (4, 4), "Ks": (3, 3), "sizes": (2,), "pixels": (), "masks": ()}
-        for name, shape in shapes.items():
+        for name, shape in SHAPES.items():
             check_shape(f"views.{name}", arrays[name], (len(names), *shape))
             if arrays[name].dtype.kind not in "if":
                 raise ValueError(f"views.{name} must be numbers; got {arrays[name].dtype}")
-        return RecordedViews(tuple(names), **{name: arrays[name] for name in shapes})
+        return RecordedViews(tuple(names), **{name: arrays[name] for name in SHAPES})
 
     def check(self, views: Sequence[View]) -> None:
         """Raise ValueError if a training is resumed with other views, sizes or cameras; warn of other pixels."""

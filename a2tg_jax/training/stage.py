@@ -1,7 +1,6 @@
 """A stage: an appearance, events, loss terms, learning rates and a length. A system is a sequence of stages."""
 
 import bisect
-import dataclasses
 import functools
 import inspect
 import math
@@ -17,7 +16,7 @@ from jax import Array
 
 from a2tg_jax.appearance import Appearance, allocate_appearance, count_floats
 from a2tg_jax.appearance.base import check_appearance
-from a2tg_jax.base.checks import check_kind, check_number, fields_of, kind_of
+from a2tg_jax.base.checks import check_fields, check_kind, fields_of, kind_of
 from a2tg_jax.base.config_json import check_config
 from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.text import shortened
@@ -25,7 +24,7 @@ from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.gaussians import Gaussians, no_rows
 from a2tg_jax.core.pytree import beside, check_pytree, pytree, static
 from a2tg_jax.core.sh import NUM_BASES
-from a2tg_jax.events import Event, HostEvent, StepEvent, Times, every_iteration
+from a2tg_jax.events import Event, HostEvent, StepEvent, Times
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.render_types import RenderOutput
@@ -57,9 +56,8 @@ class LearningRates(NamedFields):
 
     def check_options(self) -> None:
         """Raise ValueError, beginning with the name of the field, if a rate is out of range."""
-        for field in dataclasses.fields(self):
-            check_number(field.name, getattr(self, field.name), least=0)
-        check_number("means_final_factor", self.means_final_factor, above=0)  # The decay is exponential.
+        check_fields(self, least=0)
+        check_fields(self, "means_final_factor", above=0)  # The decay is exponential.
 
     def of_gaussians(self, means: Array, sh_degree: int = 3) -> Gaussians:
         """Return one rate per field of the Gaussians, which broadcasts against it.
@@ -204,11 +202,10 @@ class Stage(NamedFields):
         kinds = sorted({event.statistic for event in self.events if event.statistic is not None})
         if len(kinds) > 1:
             raise ValueError(f"the events of one stage must use one statistic; the events of {self.name!r} use {kinds}")
-        with fields_of(f"{where} rates"):
-            self.rates.check_options()
-        parts: tuple[Event | Correction, ...] = (*self.events, *self.corrections)
-        for part in parts:
-            with fields_of(f"{where} {type(part).__name__}"):
+        parts: list[tuple[str, Any]] = [("rates", self.rates)]
+        parts += [(type(part).__name__, part) for part in (*self.events, *self.corrections)]
+        for name, part in parts:
+            with fields_of(f"{where} {name}"):
                 check_config(part)
                 part.check_options()
         for event in self.events:
@@ -274,8 +271,11 @@ class Stage(NamedFields):
     @property
     def lasting_events(self) -> tuple[Event, ...]:
         """Events that happen after every iteration, such as noise (host)."""
-        all_times = every_iteration(self.iterations)
-        return tuple(event for event, times in zip(self.events, self.times, strict=True) if times == all_times)
+        return tuple(event for event, times in zip(self.events, self.times, strict=True) if self._are_all(times))
+
+    def _are_all(self, times: Times) -> bool:
+        """Return whether times, which ascend, are all iterations."""
+        return len(times) == self.iterations and times[0] == 1 and times[-1] == self.iterations
 
     def clock(self, iteration: int, largest_loss: float = math.inf, stride: int = 1) -> "Clock":
         """Return the schedule of an iteration, whose step is not taken if its loss exceeds the largest. The step counts
@@ -283,7 +283,7 @@ class Stage(NamedFields):
         num_left: list[int | None] = []
         for event, times in zip(self.events, self.times, strict=True):
             # An event of every iteration needs no condition in the step.
-            if not isinstance(event, StepEvent) or times == every_iteration(self.iterations):
+            if not isinstance(event, StepEvent) or self._are_all(times):
                 num_left.append(None)
                 continue
             num_past = bisect.bisect_right(times, iteration)

@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh
 
-from a2tg_jax.appearance import Appearance, project_appearance
+from a2tg_jax.appearance import project_appearance
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.optim import AdamState, adam_update
@@ -33,7 +33,7 @@ from a2tg_jax.training.corrections import (
     penalties,
     updated,
 )
-from a2tg_jax.training.gradients import TracedView, differentiate
+from a2tg_jax.training.gradients import Differentiated, TracedView, differentiate
 from a2tg_jax.training.returned import calling, check_kept, check_scalar, checked_change
 from a2tg_jax.training.stage import Background, Clock, Stage
 from a2tg_jax.training.terms import Target
@@ -112,17 +112,11 @@ class StepInfo(NamedTuple):
     """Summands of the loss by name."""
 
 
-class BatchGradients(NamedTuple):
-    """Loss and gradients of the V views of a step, [V, ...]."""
+class Figures(NamedTuple):
+    """Figures of a view besides its loss."""
 
-    loss: Array
     psnr: Array
-    num_pairs: Array
     is_overflow: Array
-    grads: tuple[Gaussians, Appearance, tuple[Array, ...]]
-    """Gradients in the Gaussians, in the floats of their appearance, and in the view's row of each correction."""
-    statistic: Array | None
-    """[V, N, 4], the gradient at the probe of `render_traced`; None if no event gathers it."""
     terms: dict[str, Array]
     """Summands of the loss by name."""
 
@@ -130,7 +124,8 @@ class BatchGradients(NamedTuple):
 class Attempt(NamedTuple):
     """Outcome of a step, taken or not."""
 
-    views: BatchGradients
+    views: Differentiated
+    """Losses, gradients and `Figures` of the V views, [V, ...]."""
     grads: tuple[Gaussians, Any, tuple[Array, ...]]
     """Mean gradients over the views; of corrections, gradients in the row of each view [V, ...]."""
     state: TrainState
@@ -151,11 +146,12 @@ def train_step(settings: StepSettings, state: TrainState, inputs: StepInputs) ->
     """Run one iteration. The settings are static; the state is donated."""
     tried = attempt(settings, state, inputs)
     drawn = tried.views
+    figures: Figures = drawn.auxiliary
     # The last assignment wins: after an overflow all other numbers are meaningless.
     status = jnp.where(tried.info.is_possible, FINE, IMPOSSIBLE)
-    status = jnp.where(jnp.mean(drawn.loss) > inputs.clock.largest_loss, EXPLODED, status)
+    status = jnp.where(jnp.mean(drawn.value) > inputs.clock.largest_loss, EXPLODED, status)
     status = jnp.where(tried.is_finite, status, NOT_FINITE)
-    status = jnp.where(jnp.any(drawn.is_overflow), OVERFLOW, status).astype(jnp.int32)
+    status = jnp.where(jnp.any(figures.is_overflow), OVERFLOW, status).astype(jnp.int32)
     status = jnp.where(state.status == FINE, status, state.status)
     # Chosen inside the step, because it has taken over the old state's buffers.
     taken = dataclasses.replace(tried.state, status=status)
@@ -164,13 +160,13 @@ def train_step(settings: StepSettings, state: TrainState, inputs: StepInputs) ->
     chosen = with_rows_divided(settings.mesh, chosen)
     return chosen, StepInfo(
         iteration=chosen.iteration,
-        loss=jnp.mean(drawn.loss),
-        psnr=jnp.mean(drawn.psnr),
+        loss=jnp.mean(drawn.value),
+        psnr=jnp.mean(figures.psnr),
         num_pairs=jnp.max(drawn.num_pairs),
         status=status,
         num_live=chosen.model.num_live,
         num_refused=tried.info.num_refused,
-        terms=jax.tree.map(jnp.mean, drawn.terms),
+        terms=jax.tree.map(jnp.mean, figures.terms),
     )
 
 
@@ -196,9 +192,8 @@ def attempt(settings: StepSettings, state: TrainState, inputs: StepInputs) -> At
     for event, event_state in zip(stage.events, state.events, strict=True):
         is_gathering |= event_state is not None and event.statistic is not None
     drawn = batch_gradients(settings, inputs, model, batch, backgrounds, iteration, correction_rows, is_gathering)
-    of_gaussians, of_appearance, of_corrections = drawn.grads
     # Gradients of corrections belong to one view each.
-    grads = jax.tree.map(lambda g: jnp.mean(g, axis=0), (of_gaussians, of_appearance))
+    grads = jax.tree.map(lambda g: jnp.mean(g, axis=0), (drawn.gaussians, drawn.appearance))
 
     progress = clock.progress(state.iteration)
     decay = jnp.exp(clock.log_decay * progress)
@@ -214,7 +209,7 @@ def attempt(settings: StepSettings, state: TrainState, inputs: StepInputs) -> At
     change = _after_events(settings, inputs, now, seen, Change(model, moments, state.events))
     corrections = tuple(
         updated(correction, correction_state, inputs.views, grad, progress)  # type: ignore[arg-type]
-        for correction, correction_state, grad in zip(stage.corrections, state.corrections, of_corrections, strict=True)
+        for correction, correction_state, grad in zip(stage.corrections, state.corrections, drawn.rows, strict=True)
     )
     after = TrainState(change.model, change.moments, change.state, iteration, state.status, corrections)
     changed: Any = partition(change.model)[0]
@@ -224,23 +219,22 @@ def attempt(settings: StepSettings, state: TrainState, inputs: StepInputs) -> At
         ids_after_adam = {id(leaf) for leaf in jax.tree.leaves(step.params)}
         changed = [leaf for leaf in jax.tree.leaves(changed) if id(leaf) not in ids_after_adam]
     rows_after = [correction.rows for correction in corrections]
-    is_finite = _are_finite(jax.tree.leaves((drawn.loss, grads, of_corrections, changed, rows_after)))
-    return Attempt(drawn, (*grads, of_corrections), after, change.info, is_finite)
+    is_finite = _are_finite(jax.tree.leaves((drawn.value, grads, drawn.rows, changed, rows_after)))
+    return Attempt(drawn, (*grads, drawn.rows), after, change.info, is_finite)
 
 
-def _seen(stage: Stage, batch: Photographs, correction_rows: tuple[Array, ...], drawn: BatchGradients) -> Seen:
+def _seen(stage: Stage, batch: Photographs, correction_rows: tuple[Array, ...], drawn: Differentiated) -> Seen:
     """Return what events observe of a step: its cameras, and the gradients of the splats in each view."""
     height, width = batch.images.shape[1:3]
     cameras = Camera(batch.viewmats, batch.Ks, width, height)
     if correction_rows:
         cameras = jax.vmap(functools.partial(corrected_camera, stage.corrections))(correction_rows, cameras)
-    of_gaussians, *_ = drawn.grads
     # ∂L/∂colour: the colour is linear in the first coefficient, with the factor SH_C0.
-    colors = of_gaussians.sh[:, :, 0] / SH_C0
+    colors = drawn.gaussians.sh[:, :, 0] / SH_C0
     seen = Seen(cameras, jnp.zeros_like(colors), jnp.zeros(colors.shape[:2], bool), colors)
-    if drawn.statistic is None or stage.statistic is None:
+    if drawn.probe is None or stage.statistic is None:
         return seen
-    gradients, is_visible = read_probe(drawn.statistic, stage.statistic, width, height)
+    gradients, is_visible = read_probe(drawn.probe, stage.statistic, width, height)
     return seen._replace(gradients=gradients, is_visible=is_visible)
 
 
@@ -263,8 +257,8 @@ def batch_gradients(
     iteration: Array,
     correction_rows: tuple[Array, ...],
     is_gathering: bool,
-) -> BatchGradients:
-    """Return loss and gradients of V views, which a device draws one after the other.
+) -> Differentiated:
+    """Return losses, gradients and `Figures` of V views [V, ...], which a device draws one after the other.
 
     Backgrounds are [V, 3]; `correction_rows` has the rows [V, ...] of each correction. `is_gathering`: whether an event
     still gathers the stage's statistic.
@@ -275,9 +269,7 @@ def batch_gradients(
     highest = settings.render.sh_degree
     degree = jnp.minimum((iteration - 1) // clock.sh_interval, highest) if stage.raises_sh_degree else highest
 
-    def loss(
-        model: Model, view: TracedView, output: RenderOutput
-    ) -> tuple[Array, tuple[Array, Array, dict[str, Array]]]:
+    def loss(model: Model, view: TracedView, output: RenderOutput) -> tuple[Array, Figures]:
         image, alpha, mask, depth = view.target
         photograph = over_background(image, alpha, view.background)
         color = corrected_color(view.corrections, view.rows, output.color)
@@ -286,7 +278,8 @@ def batch_gradients(
             color = jnp.where(mask[..., None], color, jnp.zeros_like(color))
         target = Target(view.camera, photograph, view.background, mask, clock.progress(iteration - 1), depth)
         output = dataclasses.replace(output, color=color)
-        parts_by_name: dict[str, Array] = {}
+        added = penalties(view.corrections, view.rows)
+        parts_by_name = {"corrections": functools.reduce(jnp.add, added)} if added else {}
         values: list[Array] = []
         for index, term in enumerate(stage.losses):
             if hasattr(term, "parts"):
@@ -297,9 +290,6 @@ def batch_gradients(
                 check_scalar(f"losses[{index}]", part)
                 parts_by_name[name if name not in parts_by_name else f"{name}_{index + 1}"] = part
             values.append(functools.reduce(jnp.add, parts.values()))
-        added = penalties(view.corrections, view.rows)
-        if added:
-            parts_by_name["corrections"] = functools.reduce(jnp.add, added)
         value = functools.reduce(jnp.add, [*values, *added])
         # PSNR is of what a screen shows; the loss is of unclipped colours (`losses`).
         error = jnp.mean((jnp.clip(output.color, 0, 1) - target.image) ** 2)
@@ -307,21 +297,17 @@ def batch_gradients(
             share = jnp.mean(mask.astype(error.dtype))
             # No pixel of a halved photograph may count.
             error = error / jnp.maximum(share, 1 / mask.size)
-        return value, (error, output.overflow, parts_by_name)
+        return value, Figures(-10 * jnp.log10(error), output.overflow, parts_by_name)
 
-    def gradients_of(model: Model, arrays: tuple[Any, ...]) -> BatchGradients:
+    def gradients_of(model: Model, arrays: tuple[Any, ...]) -> Differentiated:
         viewmat, K, background, rows, pictures = arrays
         view = TracedView(Camera(viewmat, K, width, height, batch.rays), background, stage.corrections, rows, pictures)
-        result = differentiate(
+        return differentiate(
             loss, model, view, settings.render,
             has_geometry=stage.has_geometry, sh_degree=degree, statistic=stage.statistic, has_probe=is_gathering,
         )  # fmt: skip
-        error, overflow, terms = result.auxiliary
-        grads = result.gaussians, result.appearance, result.rows
-        psnr = -10 * jnp.log10(error)
-        return BatchGradients(result.value, psnr, result.num_pairs, overflow, grads, result.probe, terms)
 
-    def gradients_of_views(model: Model, arrays: tuple[Any, ...]) -> BatchGradients:
+    def gradients_of_views(model: Model, arrays: tuple[Any, ...]) -> Differentiated:
         return jax.lax.map(functools.partial(gradients_of, model), arrays)
 
     pictures = batch.images, batch.alphas, batch.masks, batch.depths

@@ -79,7 +79,12 @@ class Lab:
     def own_scenes(self) -> tuple[SceneAt, ...]:
         """Return the scenes given by path, which take the place of the scale's."""
         downscale = 1 if self.args.downscale is None else self.args.downscale
-        return tuple(own_scene(path, downscale) for path in self.args.scene)
+        scenes: dict[str, SceneAt] = {}
+        for path in self.args.scene:
+            scene = own_scene(path, downscale)
+            if scenes.setdefault(scene.label, scene) != scene:
+                raise ValueError(f"two folders of --scene are called {scene.label}, one in tables: rename one of them")
+        return tuple(scenes.values())
 
     @property
     def is_smoke(self) -> bool:
@@ -193,15 +198,17 @@ class Lab:
         """Raise if a scene is missing or an option invalid, before anything is trained."""
         check_systems(grids, self.records)
         for path in {cell.scene.path for grid in grids for cell in grid.cells} - BUILT_IN.keys():
-            if not Path(path).is_absolute() and not self.folders.scenes.is_dir():
+            # An absolute path stays as it is.
+            if (self.folders.scenes / path).is_dir():
+                continue
+            if Path(path).is_absolute():
+                raise ValueError(f"there is no scene folder {path}")
+            if not self.folders.scenes.is_dir():
                 raise ValueError(f"there is no folder --scenes {self.folders.scenes}")
-            if not (self.folders.scenes / path).is_dir():
-                if Path(path).is_absolute():
-                    raise ValueError(f"there is no scene folder {path}")
-                raise ValueError(
-                    f"there is no scene {self.folders.scenes / path}: --scenes must name the folder of the scenes, as "
-                    "grids/scales.toml has them (a2tg download mipnerf360 tandt-db fetches those of --scale full)"
-                )
+            raise ValueError(
+                f"there is no scene {self.folders.scenes / path}: --scenes must name the folder of the scenes, as "
+                "grids/scales.toml has them (a2tg download mipnerf360 tandt-db fetches those of --scale full)"
+            )
 
     def _save(self) -> None:
         """Merge the records into the results, to which another program may have added some."""

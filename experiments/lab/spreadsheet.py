@@ -27,9 +27,8 @@ def _row(grid: str, result: Result) -> list[object]:
     cell = result.run.cell
     job = result.run.job
     place = [cell.scene.label, result.label, cell.size.replace(",", ""), result.record["num"], cell.budget, cell.seed]
-    figures = [_rounded(result.record.get(name), digits) for name, digits in DIGITS.items()]
+    figures: list[object] = []
+    for name, digits in DIGITS.items():
+        value = result.record.get(name)
+        figures.append(None if value is None else round(value, digits))
     return [grid, *place, sum(job.all_iterations), *figures, job.key]
-
-
-def _rounded(value: float | None, digits: int) -> float | None:
-    return None if value is None else round(value, digits)

@@ -216,7 +216,8 @@ def gains_table(results: Sequence[Result], reference: str, others: Sequence[str]
             every[other].setdefault(place.scene.label, []).append(float(np.mean(gains)))
             means = (float(np.mean(found)) for found in (gains, lpips, train))
             shown.append(" · ".join(signed(one, digits) for one, digits in zip(means, (2, 3, 2), strict=True)))
-        rows.append([*_place_texts(place, own[0]), number(mean(own, "mb"), 2), quality(own), _seeds(own), *shown])
+        seeds = {result.run.cell.seed for result in own}
+        rows.append([*_place_texts(place, own[0]), number(mean(own, "mb"), 2), quality(own), str(len(seeds)), *shown])
     rows.append(["*mean ± 95 % interval*", *[""] * 6, *map(_mean_and_interval, every.values())])
     header = ["scene", "pixels", "iterations", "Gaussians", "MB", f"{reference}: PSNR / SSIM / LPIPS", "seeds"]
     text = markdown([*header, *(f"against {other}: dB · LPIPS · train dB" for other in others)], rows)
@@ -229,10 +230,6 @@ def _place_texts(cell: Cell, result: Result) -> list[str]:
     length = "+".join(f"{count:,}" for count in cell.iterations)
     num = cell.gaussians if cell.budget is None else result.record["num"]
     return [cell.scene.label, f"{width}×{height}", length, f"{num:,} ({num / (width * height):.2f} a pixel)"]
-
-
-def _seeds(results: Sequence[Result]) -> str:
-    return str(len({result.run.cell.seed for result in results}))
 
 
 def _mean_and_interval(gains: Mapping[str, Sequence[float]]) -> str:

@@ -15,22 +15,18 @@ FIRST = 1
 
 def is_from_before(record: Record) -> bool:
     """Return whether an earlier version of its system made a record; systems that are not found count as unchanged."""
-    return _version(record) != _present_version(record.get("system", ""), _version(record))
+    version = record.get("version", FIRST)
+    return version != _present_version(record.get("system", ""), version)
 
 
 def as_text(records: Iterable[Record]) -> str:
     """Return in words which records are from before; empty if none is."""
     old = [record for record in records if is_from_before(record)]
-    counts = collections.Counter((record["system"], _version(record)) for record in old)
+    counts = collections.Counter((record["system"], record.get("version", FIRST)) for record in old)
     return ", ".join(
         f"{num} of {system} (version {version}, now {_present_version(system, version)})"
         for (system, version), num in sorted(counts.items())
     )
-
-
-def _version(record: Record) -> int:
-    version: int = record.get("version", FIRST)
-    return version
 
 
 @functools.cache
