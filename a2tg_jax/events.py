@@ -286,7 +286,7 @@ class FractionsEvent(HostEvent):
     """Whether the last fraction may be 1, the end of the stage."""
 
     def check_options(self) -> None:
-        self.times(1)
+        self.times(1)  # checks `at`
 
     def times(self, num_iterations: int) -> Times:
         return times_at(self.at, num_iterations, with_end=self.with_end)

@@ -250,11 +250,9 @@ def rows_of_a2tg(lab: Lab) -> list[Row]:
         records = read_kept(lab.out.parent / scale / "records.json")
         for degree, name in names.items():
             rows += rows_at_length(read_grid(name, scale), degree, records, place)
-    scale = "smoke" if lab.is_smoke else "protocol160"
-    records = read_kept(lab.out.parent / scale / "records.json")
     for degree in (3, 1, 0):
-        rows += rows_of_quick(read_grid(f"quick_degree_{degree}", scale), degree, records)
-        rows += rows_of_earlier_quick(read_grid(f"degree_{degree}", scale), degree, records)
+        rows += rows_of_quick(read_grid(f"quick_degree_{degree}", lab.scale), degree, lab.records)
+        rows += rows_of_earlier_quick(read_grid(f"degree_{degree}", lab.scale), degree, lab.records)
     return rows
 
 

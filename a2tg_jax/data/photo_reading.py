@@ -471,7 +471,7 @@ def _depth_map(file: Path, lens: Lens, stored: tuple[int, int], size: tuple[int,
 
 def read_depths(file: Path) -> np.ndarray:
     """Return the numbers [H, W] float32 of a depth map, an .npy or a greyscale PNG, whose largest value is 1."""
-    if Path(file).suffix.lower() == ".npy":
+    if file.suffix.lower() == ".npy":
         try:
             values = read_npy(file)
         except Exception as error:  # Damaged files raise anything from SyntaxError to struct.error.

@@ -244,8 +244,8 @@ def realityscan(path: Path) -> list[Cameras]:
     """Return the cameras of RealityScan's XMP files in a folder, and of those anywhere below its folder images."""
     cameras = []
     for found in (map(path.joinpath, names_in(path)), files_below(path / "images")):
-        beside = (file for file in found if file.suffix.lower() == ".xmp" and is_regular(file))
-        files = [file for file in sorted(beside) if b"xcr:Rotation" in read_regular(file, MOST_BYTES)]
+        xmp = (file for file in found if file.suffix.lower() == ".xmp" and is_regular(file))
+        files = [file for file in sorted(xmp) if b"xcr:Rotation" in read_regular(file, MOST_BYTES)]
         # Files of another alignment may be left in one of the two.
         if files:
             cameras.append(Cameras(files[0], functools.partial(_realityscan_frames, path, files), files))

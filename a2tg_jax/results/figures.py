@@ -158,7 +158,7 @@ def _thinned(column: np.ndarray) -> np.ndarray:
 
 def sizes_figure(sizes: np.ndarray) -> Figure:
     """Plot the number of Gaussians by the resolution of their textures, sizes [N, 2], as a map of Tv × Tu."""
-    # Textures grow by doubling their sides; those of a fixed size may have others.
+    # Textures grow by doubling their sides; textures of one size may have other sides.
     doubled = 2 ** np.arange(int(np.log2(max(4, sizes.max()))) + 1)
     sides = np.union1d(doubled, sizes[sizes > 0])
     counts = np.zeros((len(sides), len(sides)), int)

@@ -134,8 +134,8 @@ def is_same_so_far(a: System, b: System, index: int) -> bool:
 
 def is_equal(a: Stage, b: Stage) -> bool:
     """Return whether two stages are equal in everything, arrays and classes included."""
-    beside = [field.name for field in dataclasses.fields(Stage) if field.metadata.get("beside")]
-    if any(getattr(a, name) != getattr(b, name) for name in beside):
+    outside = [field.name for field in dataclasses.fields(Stage) if field.metadata.get("beside")]
+    if any(getattr(a, name) != getattr(b, name) for name in outside):
         return False
     # jax.tree compares classes and static fields; arrays are leaves, which == does not reduce to one bool.
     if jax.tree.structure(a) != jax.tree.structure(b):  # type: ignore[operator]

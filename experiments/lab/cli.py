@@ -198,7 +198,7 @@ class Lab:
         """Raise if a scene is missing or an option invalid, before anything is trained."""
         check_systems(grids, self.records)
         for path in {cell.scene.path for grid in grids for cell in grid.cells} - BUILT_IN.keys():
-            # An absolute path stays as it is.
+            # Joined to a folder, an absolute path does not change.
             if (self.folders.scenes / path).is_dir():
                 continue
             if Path(path).is_absolute():
@@ -207,7 +207,7 @@ class Lab:
                 raise ValueError(f"there is no folder --scenes {self.folders.scenes}")
             raise ValueError(
                 f"there is no scene {self.folders.scenes / path}: --scenes must name the folder of the scenes, as "
-                "grids/scales.toml has them (a2tg download mipnerf360 tandt-db fetches those of --scale full)"
+                "grids/scales.toml has them (a2tg download mipnerf360 tandt-db fetches the scenes of --scale full)"
             )
 
     def _save(self) -> None:

@@ -73,7 +73,7 @@ class GridFile:
     at_equal_time: tuple[str, ...] = ()
     variants: dict[str, Any] = dataclasses.field(default_factory=dict)
     scales: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Tables of the scales that it has; in the file each is a table of its own."""
+    """Tables of the scales that it has, which the file calls by their names, such as [smoke]."""
 
     def scale(self, name: str, place: str) -> Scale:
         """Return the table of a scale.

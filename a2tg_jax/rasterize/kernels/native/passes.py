@@ -560,21 +560,24 @@ class _Backward(_Pass):
         """Sum over lanes, carry the planes' cotangents to the homography, and add all to the splat's rows."""
         functions = self.functions
         sums = self.block.sums([self.b.load(total, typ=self.block_reals) for total in totals])
-        if self.settings.only_colors:
-            # Behind the opacity, as in the row.
-            first = functions.num_planes + 1
-            for k in range(self.settings.num_colors):
-                self.store(self.b.fadd(self.load(rows[0], 10 + k, self.real), sums[first + k]), rows[0], 10 + k)
-            return
         d_planes = sums[: functions.num_planes]
         others = sums[functions.num_planes :]
+        d_splats, d_probe = rows
+        if self.settings.only_colors:
+            # Behind the opacity, here and in the row.
+            self.add_to_row(d_splats, others[1 : 1 + self.settings.num_colors], first=10)
+            return
         # All pixels of a tile share the planes: their cotangents are summed first, and pulled back to M once.
         d_M = self.scalars.emit(functions.prepare_vjp, [*numbers[:9], *tile, *d_planes])
         num_others = len(numbers) - 9
+        self.add_to_row(d_splats, [*d_M, *others[:num_others]])
         # The statistic, if any, is behind the numbers of the splat.
-        for row, values in zip(rows, ([*d_M, *others[:num_others]], others[num_others:]), strict=True):
-            for k, value in enumerate(values):
-                self.store(self.b.fadd(self.load(row, k, self.real), value), row, k)
+        self.add_to_row(d_probe, others[num_others:])
+
+    def add_to_row(self, row: ir.Value, values: Sequence[ir.Value], first: int = 0) -> None:
+        """Add numbers to those in memory from an address on, from the number `first` on."""
+        for k, value in enumerate(values, first):
+            self.store(self.b.fadd(self.load(row, k, self.real), value), row, k)
 
 
 @functools.cache
