@@ -40,8 +40,8 @@ def test_weights_are_those_of_the_oracle(seed):
 @pytest.mark.long
 @pytest.mark.usefixtures("x64")
 def test_weights_are_summed_over_views_of_any_size():
-    model = jax.tree.map(lambda x: x.astype(float), Model(some_state()[0].gaussians))
-    camera = a2tg.synthetic_scene(num_views=3, width=24, height=16).train[0].camera
+    float32 = Model(some_state()[0].gaussians), a2tg.synthetic_scene(num_views=3, width=24, height=16).train[0].camera
+    model, camera = jax.tree.map(lambda x: jnp.asarray(x, float), float32)
     views = [seen_from(one) for one in (camera, dataclasses.replace(camera, width=20, height=10), camera)]
     parts = [shown_in(model, Due(views=[view])).weights for view in views]
     np.testing.assert_allclose(shown_in(model, Due(views=views)).weights, sum(parts), rtol=1e-12)
