@@ -65,6 +65,24 @@ class SeesBackground(a2tg.HostEvent):
         return a2tg.Change(model, moments, state)
 
 
+@a2tg.pytree
+class SeesStatistics(a2tg.HostEvent):
+    """Notes in how many views the Gaussians of all rows were seen, and the number of Gaussians."""
+
+    seen: ClassVar[list] = []
+
+    @property
+    def statistic(self):
+        return "position"
+
+    def times(self, num_iterations):
+        return PruneFaint().times(num_iterations)
+
+    def apply(self, due, model, moments, state):
+        self.seen.append((np.asarray(state.views), model.num))
+        return a2tg.Change(model, moments, state)
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Own(a2tg.System):
     """One stage with the events given."""
@@ -116,6 +134,15 @@ def test_rows_that_cannot_be_removed_are_refused(name, is_kept, message):
     model = some_model(name)
     with pytest.raises(ValueError, match=message):
         a2tg.keep_rows(model, adam_init(partition(model)[0]), (), is_kept)
+
+
+def test_statistics_of_removed_gaussians_are_gone(scene):
+    """Gaussians that are added later take their rows."""
+    SeesStatistics.seen.clear()
+    fitted(scene, PruneFaint(), SeesStatistics(), iterations=8)
+    assert [num for _, num in SeesStatistics.seen] == [45, 40]
+    for views, num in SeesStatistics.seen:
+        assert views[:num].any() and not views[num:].any()
 
 
 @pytest.mark.long

@@ -70,7 +70,7 @@ class Bytewise(TwoStages):
     """Options of the texture lookup."""
 
     name: ClassVar[str] = "bytewise"
-    version: ClassVar[int] = 7
+    version: ClassVar[int] = 8
 
     @property
     def initial_sh_degree(self) -> int:

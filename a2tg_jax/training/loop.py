@@ -10,18 +10,21 @@ import datetime
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from a2tg_jax.base.even_spacing import evenly_chosen
 from a2tg_jax.base.machine import Devices
 from a2tg_jax.base.text import in_bytes
 from a2tg_jax.core.cameras import halved_camera
 from a2tg_jax.core.compilations import compilations
-from a2tg_jax.core.table import Layout
-from a2tg_jax.events import Due, HostEvent, StepEvent
+from a2tg_jax.core.numerics import where_rows
+from a2tg_jax.core.table import Layout, map_rows
+from a2tg_jax.events import Change, Due, Event, HostEvent, StepEvent
 from a2tg_jax.model import Model
 from a2tg_jax.parallel import any_process, divided, everywhere, mesh_of, num_processes, whole
 from a2tg_jax.rasterize.render_types import RenderSettings
@@ -512,9 +515,20 @@ class StageRun:
         self.state = dataclasses.replace(self.state, model=change.model, moments=change.moments)
         if change.rows is not None:  # Statistics of other events move along with the Gaussians.
             pairs = zip(self.stage.events, self.state.events, strict=True)
-            states = (None if state is None else other.gather(state, change.rows) for other, state in pairs)
+            states = [None if state is None else self._moved(other, state, change) for other, state in pairs]
             self.state = dataclasses.replace(self.state, events=tuple(states))
         self._keep(place, change.state)
+
+    @staticmethod
+    def _moved(event: Event, state: Any, change: Change) -> Any:
+        """Return the state of an event after rows have moved. Rows of removed Gaussians begin anew, because Gaussians
+        that are added between steps take them over."""
+        is_removed = jnp.arange(change.model.num_rows) >= change.model.live_count
+
+        def renewed(moved: Array, initial: Array) -> Array:
+            return where_rows(is_removed, initial, moved) if moved.ndim else moved
+
+        return map_rows(renewed, lambda moved, _: moved, event.gather(state, change.rows), event.init(change.model))
 
     def _keep(self, place: int, state: object) -> None:
         """Replace the state of the event at a place."""
