@@ -215,7 +215,7 @@ def events(folder):
     run.steps(1, 2)
     before = run.whole_state
     assert len(np.unique(before.events[0].gradients.total)) > 20 and len(np.unique(before.events[2])) > 20
-    run._host_events(2)
+    run.apply_events(2)
     after = run.whole_state
     np.testing.assert_array_equal(after.model.gaussians.means, before.model.gaussians.means[::-1])
     np.testing.assert_array_equal(after.events[0].gradients.total, before.events[0].gradients.total[::-1])

@@ -562,6 +562,7 @@ CALLS = {
     "staged(rates=0.1)": "stage 'own' … rates … LearningRates … float",
     "staged(appearance=Appearance(exponents=Exponents()))": "stage 'own' … appearance_rate … learning rate … exponents",
     "staged(appearance=Appearance(texture=Texture()))": "stage 'own' … appearance_rate … learning rate … texture",
+    "staged(appearance_rate={'texture': -1e-2})": "stage 'own' … appearance_rate … at least 0 … -0.01",
     "staged(iterations='30')": "stage 'own' … iterations … integer … '30'",
     "staged(events=Noise())": "stage 'own' … events … tuple or a list … Noise",
     "staged(events=(Noise(), Noise))": "stage 'own' … events[1] … StepEvent or a HostEvent … the class Noise",

@@ -206,7 +206,7 @@ def test_what_other_events_have_gathered_follows(scene):
     totals = {tuple(mean): total for mean, total in zip(*gathered(run), strict=True)}
     assert len(set(totals.values())) > 20
     num = run.model.num
-    run._host_events(first)
+    run.apply_events(first)
     assert run.model.num < num
     means, moved = gathered(run)
     assert [totals[tuple(mean)] for mean in means] == list(moved)

@@ -10,21 +10,18 @@ import datetime
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 from a2tg_jax.base.even_spacing import evenly_chosen
 from a2tg_jax.base.machine import Devices
 from a2tg_jax.base.text import in_bytes
 from a2tg_jax.core.cameras import halved_camera
 from a2tg_jax.core.compilations import compilations
-from a2tg_jax.core.numerics import where_rows
-from a2tg_jax.core.table import Layout, map_rows
-from a2tg_jax.events import Change, Due, Event, HostEvent, StepEvent
+from a2tg_jax.core.table import Layout
+from a2tg_jax.events import Due, StepEvent
 from a2tg_jax.model import Model
 from a2tg_jax.parallel import any_process, divided, everywhere, mesh_of, num_processes, whole
 from a2tg_jax.rasterize.render_types import RenderSettings
@@ -35,10 +32,10 @@ from a2tg_jax.training.checkpoint import Checkpoint, Interrupted, state_of_check
 from a2tg_jax.training.cost import check_step_fits
 from a2tg_jax.training.divergence import DivergedError, largest_loss, what_diverged
 from a2tg_jax.training.history import COLUMNS, History
+from a2tg_jax.training.host_events import HostEvents
 from a2tg_jax.training.options import System
 from a2tg_jax.training.recorded_views import RecordedViews
 from a2tg_jax.training.reports import Display, LearningCheck, Pace, Progress, StageEffects, saved_work
-from a2tg_jax.training.returned import calling, checked_change
 from a2tg_jax.training.start import state_of_model
 from a2tg_jax.training.step import (
     EXPLODED,
@@ -57,8 +54,6 @@ from a2tg_jax.training.step import (
 LAUNCHED = 10
 """Number of steps between two waits for the device; fewer if their photographs take too much memory."""
 LOG_EVERY = 10
-WORTH_COMPILING = 1_000
-"""Remaining iterations for which it is worth compiling a step without statistics that nothing reads any more."""
 PLANNED_VIEWS = 64
 """Largest number of views that room is planned for."""
 SHORTENED = 0.1
@@ -230,6 +225,11 @@ class StageRun:
             self.views, self.order, end, system.background, is_first=index == 0, small_budget=system.small_budget
         )
         self.effects = StageEffects(self.stage, system, len({view.picture.size for view in self.views}))
+        due = Due(
+            views=self.views, background=system.background_color, seed=system.seed, layouts=self.session.layouts,
+            room=self.session.room,
+        )  # fmt: skip
+        self.events = HostEvents(self.stage, due, self.effects)
         self._progress = progress
         self._pace = self._pace_from(self._launched)
         self.capacities: dict[Size, int] = {}
@@ -241,20 +241,6 @@ class StageRun:
         self.time_left: datetime.timedelta | None = None
         """Remaining time of the run, about; None at the beginning."""
         self.num_regrown = 0
-
-        self._host_iterations: list[int] = []
-        """Iterations after which host events happen, or statistics are dropped."""
-        self._last_gathered: list[int] = []
-        """Iteration after which the statistic of each event is dropped; 0: it is kept, because too few iterations are
-        left to compile a step without it."""
-        for event, times in zip(self.stage.events, self.stage.times, strict=True):
-            if isinstance(event, HostEvent):
-                self._host_iterations += times
-            last = 0
-            if times and event.observes and end - times[-1] >= WORTH_COMPILING:
-                last = times[-1]
-                self._host_iterations.append(last)
-            self._last_gathered.append(last)
 
     @property
     def history(self) -> History:
@@ -310,7 +296,7 @@ class StageRun:
                 paused = iteration
                 stride = self.stride_after(paused)
                 pauses = [paused + (self.num_launched - paused % self.num_launched) * stride, end]
-                pauses += [pause for pause in (*self._host_iterations, self.shortened_at or 0) if pause > paused]
+                pauses += [pause for pause in (*self.events.iterations, self.shortened_at or 0) if pause > paused]
                 if checkpoint_every is not None and stride == 1:
                     pauses.append(paused + checkpoint_every - paused % checkpoint_every)
                 pause = min(pauses)
@@ -329,8 +315,8 @@ class StageRun:
                     display.tell(f"{forecast}; {in_bytes(self.memory or 0)} of memory")
                 self.time_left = self._pace.left(iteration)
                 # `iteration` is less if a step could not be taken or training is being stopped.
-                if iteration == pause and iteration in self._host_iterations:
-                    self._host_events(iteration)
+                if iteration == pause and iteration in self.events.iterations:
+                    self.apply_events(iteration)
                 self.started += self.session.watch(self, is_stopped)
                 must_stop = any_process(self.mesh, is_stopped())
                 must_save = checkpoint_every is not None and is_multiple_between(paused, iteration, checkpoint_every)
@@ -488,49 +474,8 @@ class StageRun:
             "rates.logit_opacities"
         )
 
-    # Events between steps
-
-    def _host_events(self, iteration: int) -> None:
-        """Apply the host events that follow an iteration, and drop the statistics of past events."""
-        if self.mesh is not None:
-            self.state = jax.device_put(self.whole_state)
-        for place, (event, times) in enumerate(zip(self.stage.events, self.stage.times, strict=True)):
-            if isinstance(event, HostEvent) and iteration in times:
-                self._apply(place, event, times.index(iteration) + 1, len(times))
-            # In a shortened stage it is not worth compiling a step without the statistic.
-            if iteration == self._last_gathered[place] and self.stride_after(iteration) == 1:
-                self._keep(place, None)
-        self.state = divided(self.mesh, self.state)
-
-    def _apply(self, place: int, event: HostEvent, index: int, count: int) -> None:
-        """Apply the event at a place, for the `index`-th of `count` times."""
-        due = Due(
-            index, count, self.views, self.system.background_color, self.system.seed, self.session.layouts,
-            self.session.room,
-        )  # fmt: skip
-        with calling(event, "apply", self.stage.name):
-            change = event.apply(due, self.state.model, self.state.moments, self.state.events[place])
-            change = checked_change(change)
-        self.effects.apply(place, self.state, change)
-        self.state = dataclasses.replace(self.state, model=change.model, moments=change.moments)
-        if change.rows is not None:  # Statistics of other events move along with the Gaussians.
-            pairs = zip(self.stage.events, self.state.events, strict=True)
-            states = [None if state is None else self._moved(other, state, change) for other, state in pairs]
-            self.state = dataclasses.replace(self.state, events=tuple(states))
-        self._keep(place, change.state)
-
-    @staticmethod
-    def _moved(event: Event, state: Any, change: Change) -> Any:
-        """Return the state of an event after rows have moved. Rows of removed Gaussians begin anew, because Gaussians
-        that are added between steps take them over."""
-        is_removed = jnp.arange(change.model.num_rows) >= change.model.live_count
-
-        def renewed(moved: Array, initial: Array) -> Array:
-            return where_rows(is_removed, initial, moved) if moved.ndim else moved
-
-        return map_rows(renewed, lambda moved, _: moved, event.gather(state, change.rows), event.init(change.model))
-
-    def _keep(self, place: int, state: object) -> None:
-        """Replace the state of the event at a place."""
-        events = (*self.state.events[:place], state, *self.state.events[place + 1 :])
-        self.state = dataclasses.replace(self.state, events=events)
+    def apply_events(self, iteration: int) -> None:
+        """Apply the events between steps that follow an iteration."""
+        state = self.state if self.mesh is None else jax.device_put(self.whole_state)
+        state = self.events.after(iteration, state, is_shortened=self.stride_after(iteration) > 1)
+        self.state = divided(self.mesh, state)

@@ -16,7 +16,7 @@ from jax import Array
 
 from a2tg_jax.appearance import Appearance, allocate_appearance, count_floats
 from a2tg_jax.appearance.base import check_appearance
-from a2tg_jax.base.checks import check_fields, check_kind, fields_of, kind_of
+from a2tg_jax.base.checks import check_fields, check_kind, check_number, fields_of, kind_of
 from a2tg_jax.base.config_json import check_config
 from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.text import shortened
@@ -253,6 +253,8 @@ class Stage(NamedFields):
         check_pytree(f"{where} appearance", self.appearance)
         # Two rows are enough to learn whether there are arrays, and whether they have rows.
         check_appearance(self._appearance_of_two, no_rows(2, 1))
+        for rate in jax.tree.leaves(self.appearance_rate):
+            check_number(f"{where} appearance_rate", rate, least=0.0)
         if self.appearance_rate is None and jax.tree.leaves(self._appearance_of_two):
             raise ValueError(
                 f"{where} appearance_rate must be the learning rate of the arrays of {self.appearance.description}, "
