@@ -298,19 +298,17 @@ def positional_gradient(
 
     k0, l0 = ray((M[0][0], M[1][0], M[2][0]))
     k1, l1 = ray((M[0][1], M[1][1], M[2][1]))
-
-    def like_rho(mean: Triple) -> Array:
-        """Return a number with the gradient of ρ."""
-        k2, l2 = ray(mean)
-        u = (k1 * l2 - k2 * l1) * hit.inverse
-        v = (k2 * l0 - k0 * l2) * hit.inverse
-        dx = k2 / mean[2]
-        dy = l2 / mean[2]
-        # 2·(hit.u·u + hit.v·v), with constants hit.u and hit.v, has the gradient of u² + v² at the hit.
-        return jnp.where(hit.is_ray, 2 * (hit.u * u + hit.v * v), 2 * (dx * dx + dy * dy))
-
     mean = tuple(jnp.broadcast_to(row[2], jnp.shape(d_rho)) for row in M)
-    (d_mean,) = jax.vjp(like_rho, mean)[1](d_rho)
+    (first, second, last), pull_back = jax.vjp(lambda mean: _from_center(mean, tile), mean)
+    inverse = 1 / last  # The same at all pixels: native loops divide once a splat.
+    center_x = first * inverse
+    center_y = second * inverse
+    # u = (k₁·l₂ − k₂·l₁)/p₂ and v = (k₂·l₀ − k₀·l₂)/p₂; of the low-pass filter, (k₂, l₂)/M₂₂ leads from the centre.
+    factor = d_rho * jnp.where(hit.is_ray, 2 * hit.inverse, 4 * inverse)
+    d_k2 = factor * jnp.where(hit.is_ray, hit.v * l0 - hit.u * l1, x - center_x)
+    d_l2 = factor * jnp.where(hit.is_ray, hit.u * k1 - hit.v * k0, y - center_y)
+    d_last = d_k2 * jnp.where(hit.is_ray, x, center_x) + d_l2 * jnp.where(hit.is_ray, y, center_y)
+    (d_mean,) = pull_back((-d_k2, -d_l2, d_last))
     if statistic == "position":
         components = [sum(d_mean[i] * jacobian[i][axis] for i in range(3)) for axis in range(3)]
         return tuple(jnp.abs(component) for component in components)  # type: ignore[return-value]
