@@ -290,6 +290,8 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     await shown(40);
     const textures = page.locator('#mode option[value="texture"]');
     expect(await textures.isDisabled()).toBe(true);
+    await page.keyboard.press("3");
+    expect(await page.inputValue("#mode")).toBe("full");
     // A snapshot that does not arrive whole is no end.
     scene = SCENE.subarray(0, SCENE.length - 100);
     status.version = 2;

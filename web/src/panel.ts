@@ -157,6 +157,8 @@ export class Panel {
   }
 
   private setMode(mode: Mode): void {
+    // A key or a link may name a mode that the scene lacks.
+    if (Array.from(this.mode.options).some((option) => option.value === mode && option.disabled)) return;
     this.viewer.mode = mode;
     this.mode.value = mode;
     setText("legend", LEGENDS[mode] ?? "");
