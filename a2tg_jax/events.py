@@ -198,7 +198,7 @@ class Event(NamedFields):
         return GradientStatistics.init(model.num_rows, model.gaussians.means.dtype)
 
     def gather(self, state: Any, rows: np.ndarray) -> Any:
-        """Return the state whose row i is the former row rows[i] (host). Rows of removed Gaussians then begin anew, as
+        """Return the state whose row i is the former row rows[i] (host). Rows of removed Gaussians then begin again, as
         `init` makes them, unless you override this method.
 
         Raises:

@@ -312,7 +312,7 @@ def falloff_of(curve: Curve, rho: Array) -> Array:
 
 @jax.custom_jvp
 def _power(x: Array, exponent: Array) -> Array:
-    """Return positive x to a power; unlike those of jnp.power and log, its derivatives divide by nothing."""
+    """Return positive x to a power; unlike jnp.power and log, it has derivatives that do not divide."""
     return x * jnp.exp((exponent - 1) * jnp.log(x))
 
 
