@@ -198,8 +198,8 @@ class Event(NamedFields):
         return GradientStatistics.init(model.num_rows, model.gaussians.means.dtype)
 
     def gather(self, state: Any, rows: np.ndarray) -> Any:
-        """Return the state whose row i is the former row rows[i] (host). Rows of removed Gaussians then begin again, as
-        `init` makes them, unless you override this method.
+        """Return the state whose row i is the former row rows[i] (host). Rows of removed Gaussians then begin as `init`
+        makes them, unless you override this method.
 
         Raises:
           ValueError: by default, if an array that is no field of `shared` does not have a row for each Gaussian.

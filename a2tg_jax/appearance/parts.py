@@ -312,7 +312,7 @@ def falloff_of(curve: Curve, rho: Array) -> Array:
 
 @jax.custom_jvp
 def _power(x: Array, exponent: Array) -> Array:
-    """Return positive x to a power; unlike jnp.power and log, it has derivatives that do not divide."""
+    """Return positive x to a power; its derivatives divide by nothing, unlike the ones of jnp.power and log."""
     return x * jnp.exp((exponent - 1) * jnp.log(x))
 
 

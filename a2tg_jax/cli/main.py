@@ -26,7 +26,7 @@ OVERVIEW = """usage: a2tg COMMAND [OPTIONS]
 
 Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textured scene.
 
-  a2tg demo                            train a built-in scene, about a minute on two cores
+  a2tg demo                            train a built-in scene, one to two minutes on two cores
   a2tg make photos/ --minutes 10       a page from photographs or a video, by the commands below
   a2tg sfm photos/ scene/              find camera poses for photographs or a video with COLMAP
   a2tg download --list                 benchmark data sets that can be downloaded

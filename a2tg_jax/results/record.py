@@ -70,7 +70,7 @@ class RunRecord:
     """Action if training diverges (a loss or gradient is not finite, or the loss explodes): stop, or restore the newest
     checkpoint and continue with the views in another order."""
     init: str | None = None
-    """File of splats (PLY, SPZ, SOG, a checkpoint of gsplat, ...) instead of the first stage, in the world of the
+    """File of splats (PLY, SPZ, SOG, a model of this program, ...) instead of the first stage, in the world of the
     scene folder."""
     file_budget: float | str | None = None
     """Largest size of a compact file (*.a2tgz), such as 60kB. It is written when training is over, as by a2tg compress

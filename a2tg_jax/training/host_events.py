@@ -25,7 +25,7 @@ class HostEvents:
     def __init__(self, stage: Stage, due: Due, effects: StageEffects):
         """Args:
         stage: the stage.
-        due: what each event gets, but for its `index` and `count`.
+        due: information for each event, but for its `index` and `count`.
         effects: records what the events do.
         """
         self._stage = stage
