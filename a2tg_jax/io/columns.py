@@ -12,7 +12,6 @@ import lzma
 import math
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
-from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -320,57 +319,54 @@ def from_planes(planes: np.ndarray, num_columns: int) -> np.ndarray:
 
 
 class ColumnWriter:
-    """Writer of compressed columns, in sequence.
+    """Collector of columns as byte planes, in sequence, which it codes when all are there.
 
     Args:
-      coder: of all parts.
-      ends: given ends of groups in bits; others follow from the numbers.
+      ends: first and last step of each group kept in bits, for each axis of the means after centre and spread.
     """
 
-    def __init__(self, coder: Choice, ends: Mapping[str, Sequence[float]] = MappingProxyType({})):
-        self.coder = coder
-        self.parts: list[tuple[str, str, int]] = []
-        """Name, coder and coded bytes of each part, in order."""
-        self.ends: dict[str, list[float]] = {}
-        """First and last step of each group kept in bits, for each axis of the means after centre and spread."""
+    def __init__(self, ends: Mapping[str, Sequence[float]]):
+        self.ends = ends
         self.num_unpacked = 0
         """Bytes before coding."""
-        self._known_ends = ends
-        self._pieces: list[bytes] = []
+        self._planes: list[tuple[str, np.ndarray]] = []
 
-    @property
-    def body(self) -> bytes:
-        return b"".join(self._pieces)
+    def coded(self, choice: Choice) -> tuple[list[tuple[str, str, int]], bytes]:
+        """Return name, coder and number of bytes of each part, and the coded bytes of all parts, in order."""
+        parts = []
+        pieces = []
+        for name, planes in self._planes:
+            num, height, width = _webp_shape(*planes.shape)
+            # WebP, the last of CODERS, cannot hold large planes.
+            tried: Sequence[str] = (choice,)
+            if choice == "smallest":
+                tried = CODERS if max(num * height, width) <= LONGEST_WEBP_SIDE else CODERS[:-1]
+            coded = {coder: encode(coder, planes) for coder in tried}
+            coder, piece = min(coded.items(), key=lambda pair: len(pair[1]))
+            parts.append((name, coder, len(piece)))
+            pieces.append(piece)
+        return parts, b"".join(pieces)
 
     def planes(self, name: str, planes: np.ndarray) -> None:
-        """Write uint8 [C, n]."""
-        planes = np.ascontiguousarray(planes)
-        num, height, width = _webp_shape(*planes.shape)
-        # WebP, the last of CODERS, cannot hold large planes.
-        tried: Sequence[str] = (self.coder,)
-        if self.coder == "smallest":
-            tried = CODERS if max(num * height, width) <= LONGEST_WEBP_SIDE else CODERS[:-1]
-        coded = {coder: encode(coder, planes) for coder in tried}
-        coder, piece = min(coded.items(), key=lambda pair: len(pair[1]))
-        self._pieces.append(piece)
-        self.parts.append((name, coder, len(piece)))
+        """Add uint8 [C, n]."""
+        # A copy, because planes are often the lowest bytes of much larger numbers, which would stay in memory.
+        self._planes.append((name, planes.copy()))
         self.num_unpacked += planes.size
 
     def exact(self, name: str, values: np.ndarray) -> None:
-        """Write numbers of any shape and type exactly."""
+        """Add numbers of any shape and type exactly."""
         self.planes(name, to_byte_planes(values.reshape(1, -1)))
 
     def indices(self, name: str, indices: np.ndarray, count: int) -> None:
-        """Write [n] integers below `count`; no bytes if there is one."""
+        """Add [n] integers below `count`; no bytes if there is one."""
         self.planes(name, to_planes(indices, max(count - 1, 0).bit_length()))
 
     def numbers(self, name: str, values: np.ndarray, precision: Precision, *, is_color: bool = False) -> None:
-        """Write floats [C, n]; columns of colours are red, green, blue. ValueError: they overflow float16."""
+        """Add floats [C, n]; columns of colours are red, green, blue. ValueError: they overflow float16."""
         if not isinstance(precision, int):
             self.planes(name, to_byte_planes(_finite(name, np.asarray(values), precision)))
             return
-        ends = Ends(*self._known_ends[name]) if name in self._known_ends else ends_of(values, precision)
-        self.ends[name] = list(ends)
+        ends = Ends(*self.ends[name])
         # A constant needs no planes: its ends are enough.
         if ends.low == ends.high:
             self.planes(name, np.zeros((0, values.shape[1]), np.uint8))
@@ -380,9 +376,8 @@ class ColumnWriter:
         codes = quantised(values, ends, precision)
         self.planes(name, to_planes(with_green(codes, precision, -1) if is_color else codes, precision))
 
-    def means(self, axes: Sequence[AxisSteps], keys: np.ndarray, bits: int) -> None:
-        """Write positions as places [n] along the Z curve, which ascend."""
-        self.ends["means"] = [number for axis in axes for number in axis]
+    def means(self, keys: np.ndarray, bits: int) -> None:
+        """Add positions as places [n] along the Z curve, which ascend."""
         # Neighbours on the curve have keys that differ little: most high bytes of the differences are 0.
         self.planes("means", to_planes(np.diff(keys, prepend=0), 3 * bits))
 
@@ -392,7 +387,7 @@ class ColumnReader:
 
     Args:
       body: the coded bytes.
-      parts: `ColumnWriter.parts`.
+      parts: name, coder and number of bytes of each part, from `ColumnWriter.coded`.
       ends: `ColumnWriter.ends`.
       room: largest number of bytes to unpack.
 

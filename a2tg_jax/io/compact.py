@@ -10,7 +10,7 @@ import json
 import os
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Self
 
@@ -108,9 +108,11 @@ class CompactChoices(NamedFields):
 
     def of_part(self, name: str) -> Precision:
         """Return the precision of a part of the file, such as sh_2 or texel_colors."""
-        groups = {"sh_0": "sh_0", "texel_colors": "texels", "texel_alphas": "texels"}
-        group = groups.get(name, "sh_rest" if name.startswith("sh_") else name)
-        return getattr(self, group)
+        if name.startswith("texel_"):
+            return self.texels
+        if name.startswith("sh_") and name != "sh_0":
+            return self.sh_rest
+        return getattr(self, name)
 
     def check(self) -> Self:
         """Raise ValueError, naming the choice, if one is invalid."""
@@ -208,21 +210,18 @@ def encode_model(
     model = checked_live(model)
     rows = rows_of_model(model)
     num = len(rows.means)
+    known = grids or {}
+    axes, keys = _on_curve(rows.means, choices.means, known.get("means", ()))
     # A page draws after a sixteenth of a small scene; chunks of a large one are short enough to draw after each.
     chunk = max(num, 1) if order is None else int(np.clip(-(-num // 16), LEAST_CHUNK, LARGEST_CHUNK))
-    order = np.arange(num) if order is None else order
-    # Means kept as floats still need an order along the curve.
-    bits = choices.means if isinstance(choices.means, int) else MOST_BITS
-    # With the grids of a tuned model, whose numbers are on these steps: others would round them again.
-    known = np.reshape((grids or {}).get("means", ()), (-1, 4)).tolist()
-    axes = [AxisSteps(*steps) for steps in known] or [AxisSteps.of(x, bits) for x in rows.means.T]
-    keys = morton(np.stack([axis.codes(x, bits) for axis, x in zip(axes, rows.means.T, strict=True)]), bits)
-    # Within each chunk, rows follow the Z curve: neighbours in space have similar numbers, which code well.
     starts = range(0, max(num, 1), chunk)
+    order = np.arange(num) if order is None else order
+    # Within each chunk, rows follow the Z curve: neighbours in space have similar numbers, which code well.
     order = np.concatenate([part[np.argsort(keys[part], kind="stable")] for part in np.split(order, starts[1:])])
+    keys = keys[order]
     # With given grids no splat is turned: its numbers were tuned as they are.
     rows = ordered(rows, order, turns=grids is None)
-    keys = keys[order]
+    degrees, degree_ids, degree_counts = np.unique(rows.degrees, return_inverse=True, return_counts=True)
     header: dict[str, Any] = {
         "num": num,
         "chunk": chunk,
@@ -230,50 +229,64 @@ def encode_model(
         "choices": config_to_dict(choices),
         "appearance": appearance_to_dict(model.appearance),
         "background": list(model.background),
+        "degrees": degrees.tolist(),
+        "degree_counts": degree_counts.tolist(),
     }
-    degrees, degree_counts = np.unique(rows.degrees, return_counts=True)
-    header |= {"degrees": degrees.tolist(), "degree_counts": degree_counts.tolist()}
     if rows.sizes is not None:
-        sizes, size_counts = np.unique(rows.sizes, axis=0, return_counts=True)
+        # A pair of sides as one number, which orders pairs by height, then by width.
+        pairs = rows.sizes @ [MAX_SIDE + 1, 1]
+        pairs, size_ids, size_counts = np.unique(pairs, return_inverse=True, return_counts=True)
+        sizes = np.stack(np.divmod(pairs, MAX_SIDE + 1), axis=1)
         header |= {"sizes": sizes.tolist(), "size_counts": size_counts.tolist()}
     if page is not None:
         header["page"] = dict(page)
-    ends = dict(grids or {})
-    if len(starts) > 1:  # All chunks have the same steps.
-        for name, values in _columns(rows, choices):
-            precision = choices.of_part(name)
-            if isinstance(precision, int):
-                ends.setdefault(name, ends_of(values, precision))
-
-    def encoded(coder: Choice) -> tuple[bytes, int]:
-        """Return the file and the number of bytes that it unpacks to."""
-        writer = ColumnWriter(coder, ends)
-        if model.origin is not None:
-            header["origin"] = origin_header(model.origin)
-            for name, array in origin_arrays(model.origin).items():
-                writer.exact(f"origin_{name}", np.asarray(array, ORIGIN_DTYPES[name]))
-        for start in starts:
-            places = np.arange(start, min(start + chunk, num))
-            part = rows if len(starts) == 1 else ordered(rows, places, turns=False)
-            if isinstance(choices.means, int):
-                writer.means(axes, keys[places], bits)
-            else:
-                writer.numbers("means", part.means.T, choices.means)
-            writer.indices("degrees", np.searchsorted(degrees, part.degrees), len(degrees))
-            if part.sizes is not None:
-                # A pair of sides as one number, which orders pairs as np.unique does.
-                table, wanted = (np.reshape(pairs, (-1, 2)) @ [MAX_SIDE + 1, 1] for pairs in (sizes, part.sizes))
-                writer.indices("sizes", np.searchsorted(table, wanted), len(table))
-            for name, values in _columns(part, choices):
-                writer.numbers(name, values, choices.of_part(name), is_color=name in COLORED)
-            for name in MARKS:
-                if name in marks:
-                    writer.planes(name, marks[name][order[places]][None])
-        return framed(header | {"parts": writer.parts, "ends": writer.ends}, writer.body), writer.num_unpacked
-
-    data, num_unpacked = encoded(choices.coder)
+    # Of all rows, so that all chunks have the same steps.
+    ends: dict[str, Sequence[float]] = {}
+    if isinstance(choices.means, int):
+        ends["means"] = [number for axis in axes for number in axis]
+    for name, values in _columns(rows, choices):
+        precision = choices.of_part(name)
+        if isinstance(precision, int):
+            ends[name] = known[name] if name in known else ends_of(values, precision)
+    writer = ColumnWriter(ends)
+    if model.origin is not None:
+        header["origin"] = origin_header(model.origin)
+        for name, array in origin_arrays(model.origin).items():
+            writer.exact(f"origin_{name}", np.asarray(array, ORIGIN_DTYPES[name]))
+    for places in np.split(np.arange(num), starts[1:]):
+        part = rows if len(starts) == 1 else ordered(rows, places, turns=False)
+        if isinstance(choices.means, int):
+            writer.means(keys[places], choices.means)
+        else:
+            writer.numbers("means", part.means.T, choices.means)
+        writer.indices("degrees", degree_ids[places], len(degrees))
+        if rows.sizes is not None:
+            writer.indices("sizes", size_ids[places], len(sizes))
+        for name, values in _columns(part, choices):
+            writer.numbers(name, values, choices.of_part(name), is_color=name in COLORED)
+        for name, of_rows in marks.items():
+            writer.planes(name, of_rows[order[places]][None])
+    data = framed(header, writer, choices.coder)
     # Very repetitive numbers are not coded: readers would take the file for a decompression bomb.
-    return data if num_unpacked <= room_of(len(data)) else encoded("none")[0]
+    return data if writer.num_unpacked <= room_of(len(data)) else framed(header, writer, "none")
+
+
+def _on_curve(means: np.ndarray, precision: Precision, known: Sequence[float]) -> tuple[list[AxisSteps], np.ndarray]:
+    """Return the steps of each axis, and the places [N] along the Z curve of means [N, 3] on these steps.
+
+    Args:
+      means: the positions.
+      precision: precision of the means.
+      known: centre, spread, first and last step of each axis, for a tuned model, whose numbers are on these steps:
+        others would round them again. Empty: the steps follow from the means.
+    """
+    # Means kept as floats still need an order along the curve.
+    bits = precision if isinstance(precision, int) else MOST_BITS
+    axes = [AxisSteps(*steps) for steps in np.reshape(known, (-1, 4)).tolist()]
+    if not axes:
+        axes = [AxisSteps.of(x, bits) for x in means.T]
+    codes = [axis.codes(x, bits) for axis, x in zip(axes, means.T, strict=True)]
+    return axes, morton(np.stack(codes), bits)
 
 
 def _columns(rows: Rows, choices: CompactChoices) -> Iterator[tuple[str, np.ndarray]]:
@@ -339,9 +352,12 @@ def decode_model(data: bytes, where: str = "the compact scene") -> Model:
         return model_of(joined_rows(parts), header["base_degree"], appearance, origin, background_of(header))
 
 
-def framed(header: Mapping[str, object], body: bytes) -> bytes:
+def framed(header: Mapping[str, object], columns: ColumnWriter, coder: Choice) -> bytes:
+    """Return the file with a header and columns."""
+    parts, body = columns.coded(coder)
+    whole = {**header, "parts": parts, "ends": columns.ends}
     # Browsers read the header with JSON.parse, which rejects NaN.
-    text = json.dumps(header, allow_nan=False, separators=(",", ":")).encode()
+    text = json.dumps(whole, allow_nan=False, separators=(",", ":")).encode()
     coded = zlib.compress(text, 9)
     rest = coded + body
     return HEAD.pack(MAGIC, VERSION, len(coded), len(text), zlib.crc32(rest)) + rest
