@@ -105,8 +105,10 @@ class RunResult:
     @property
     def compared(self) -> list[str]:
         """The finished last models of the other systems; none before the main system is finished."""
-        last = [chain[-1] for chain in self.plan.chains.values()]
-        return [name for name in last[1:] if name in self.models and self.main == last[0] != name]
+        main, *others = [chain[-1] for chain in self.plan.chains.values()]
+        if self.main != main:
+            return []
+        return [name for name in others if name in self.models and name != main]
 
     @property
     def gains(self) -> dict[str, float]:
@@ -343,37 +345,20 @@ def write_report(
 ) -> None:
     """Write report.html from the results, some views, and the figures in the run folder. If `test_every` chose the test
     views, which a scene may also list, the page says how to train on all."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined  # Its import is slow, and few commands need it.
-    from markupsafe import Markup
-
-    loader = PackageLoader("a2tg_jax.results")
-    pages = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    # Browsers accept only this style and script, by hash, so that no text from a scene can act as one.
-    # Pictures are data: URIs, so that the page is one file.
-    policy = "default-src 'none'; img-src data:"
-    inlined = {}
-    for name, suffix in (("style", "css"), ("script", "js")):
-        text = loader.get_source(pages, f"report.{suffix}")[0]
-        # A CSP hash covers the exact text between the tags.
-        digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
-        policy += f"; {name}-src 'sha256-{digest}'"
-        inlined[name] = Markup(text)
     main = result.models[result.main]
-    held_out = result.record.scene.held_out
-    # The main model comes first, where a phone shows it, then its earlier stages, and compared systems last.
-    order = [result.main, *reversed(result.plan.main)]
-    names = sorted(result.models, key=lambda name: order.index(name) if name in order else len(order))
-    titles, rows = summary_table(result, names)
-    seconds = {name: model.seconds for name, model in result.models.items()}
-    main_seconds = sum(seconds[name] for name in result.plan.main if name in seconds)
     record = result.record
+    held_out = record.scene.held_out
+    # The main model comes first, where a phone shows it, then its earlier stages, and compared systems last.
+    order = dict.fromkeys([*reversed(result.plan.main), *result.models])
+    names = [name for name in order if name in result.models]
+    titles, rows = summary_table(result, names)
+    main_seconds = sum(result.models[name].seconds for name in result.plan.main if name in result.models)
+    other_seconds = sum(model.seconds for model in result.models.values()) - main_seconds
     leaves = flatten_config(record.scene, "scene.") | flatten_config(record.options)
     leaves |= {f"shortened_at.{name}": iteration for name, iteration in record.shortened_at.items()}
-    page = pages.get_template("report.html").render(
-        **inlined,
-        policy=Markup(policy),
+    page = _rendered(
         title=f"{next(iter(result.plan.chains))} on {result.scene}",
-        about=(inspect.getdoc(type(result.record.options)) or "").split("\n", 1)[0],
+        about=(inspect.getdoc(type(record.options)) or "").split("\n", 1)[0],
         result=result,
         main=main,
         held_out=held_out,
@@ -382,7 +367,7 @@ def write_report(
         gains=[(name, bytes_compared(result, name), gain) for name, gain in result.gains.items()],
         device=jax.devices()[0].platform.upper(),
         own_time=minutes(main_seconds),
-        other_time=minutes(sum(seconds.values()) - main_seconds),
+        other_time=minutes(other_seconds),
         megabytes=megabytes,
         summary=(titles, rows, _marked(rows)),
         rows_shown=[row[0] for row in rows],
@@ -401,6 +386,27 @@ def write_report(
         record=read_regular(run.record, MOST_TOML_BYTES).decode() if is_regular(run.record) else "",
     )
     write_whole(run.own(run.report), page)
+
+
+def _rendered(**values: object) -> str:
+    """Return the text of report.html, one file, given the values that its template shows.
+
+    Browsers accept only its own style and script, by hash, so that no text from a scene can act as one. Pictures are
+    data: URIs.
+    """
+    from jinja2 import Environment, PackageLoader, StrictUndefined  # Its import is slow, and few commands need it.
+    from markupsafe import Markup
+
+    loader = PackageLoader("a2tg_jax.results")
+    pages = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    policy = "default-src 'none'; img-src data:"
+    for name, suffix in (("style", "css"), ("script", "js")):
+        text = loader.get_source(pages, f"report.{suffix}")[0]
+        # A CSP hash covers the exact text between the tags.
+        digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+        policy += f"; {name}-src 'sha256-{digest}'"
+        values[name] = Markup(text)
+    return pages.get_template("report.html").render(**values, policy=Markup(policy))
 
 
 def _marked(rows: Sequence[Sequence[str]]) -> set[tuple[int, int]]:
