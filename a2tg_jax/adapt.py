@@ -156,46 +156,48 @@ class Upscale(HostEvent):
                 f"{model.appearance.description} cannot grow textures: the stage needs Appearance(texture=Texture())"
             )
         textures = model.textures
-        num = model.num
-        old_sizes = textures.sizes
         # Only rows that exist can grow.
-        sizes = old_sizes[:num]
+        num = model.num
+        sizes = textures.sizes[:num]
         scales = np.asarray(model.gaussians.scales)[:num]
         averages = np.asarray(state.average())[:num]
-        new_sizes = old_sizes.copy()
-
-        def propose(sizes: np.ndarray, anisotropic: bool) -> np.ndarray:
-            return next_sizes(
-                sizes, scales, k_a=self.k_a, k_s=self.k_s, cap=self.cap, anisotropic=anisotropic, axes=self.axes
-            )
-
-        proposed = propose(sizes, self.anisotropic)
+        proposed = self._proposed(sizes, scales, self.anisotropic, self.cap)
         if self.select == "budget":
             rule = {"budget_bytes": event_budget(self._budget_bytes, model.num_bytes, due.index, due.count)}
         else:
             rule = {self.select: getattr(self, self.select)}
         mask = select(averages, sizes, proposed, **rule)
-        grown = np.where(mask[:, None], proposed, sizes)
         unused = self._unused(sizes[mask], scales[mask])
+        grown = np.where(mask[:, None], proposed, sizes)
+        # If the last event has bytes for every proposal, the remaining ones pay for further upscalings.
         if self.select == "budget" and due.index == due.count and (grown == proposed).all():
-            # The last event, and every proposal fits: the remaining bytes pay for further upscalings by the same rule,
-            # then of both axes.
             left = rule["budget_bytes"] - _bytes_between(sizes, grown)
-            for anisotropic in (self.anisotropic, False):
-                while True:
-                    proposed = propose(grown, anisotropic)
-                    mask = select(averages, grown, proposed, budget_bytes=left)
-                    if not mask.any():
-                        break
-                    larger = np.where(mask[:, None], proposed, grown)
-                    left -= _bytes_between(grown, larger)
-                    grown = larger
+            grown = self._grown_within(left, grown, scales, averages)
+        new_sizes = textures.sizes
         new_sizes[:num] = grown
-        kept = None if self.moments == "copied" else (new_sizes == old_sizes).all(axis=1)
+        kept = None if self.moments == "copied" else (new_sizes == textures.sizes).all(axis=1)
         rebuilt = reallocate(textures, new_sizes, moments, tuple(due.layouts), kept, textures.layout)
         due.layouts.add(rebuilt.textures.layout)
         model = model.with_textures(rebuilt.textures)
         return Change(model, rebuilt.moments, self.init(model), unused=unused)
+
+    def _proposed(self, sizes: np.ndarray, scales: np.ndarray, anisotropic: bool, cap: int) -> np.ndarray:
+        """Return the sizes after one upscaling of all textures."""
+        return next_sizes(sizes, scales, k_a=self.k_a, k_s=self.k_s, cap=cap, anisotropic=anisotropic, axes=self.axes)
+
+    def _grown_within(self, left: int, sizes: np.ndarray, scales: np.ndarray, averages: np.ndarray) -> np.ndarray:
+        """Return sizes after as many upscalings as fit in the bytes that are left: by the event's rule, then of both
+        axes."""
+        for anisotropic in (self.anisotropic, False):
+            while True:
+                proposed = self._proposed(sizes, scales, anisotropic, self.cap)
+                mask = select(averages, sizes, proposed, budget_bytes=left)
+                if not mask.any():
+                    break
+                grown = np.where(mask[:, None], proposed, sizes)
+                left -= _bytes_between(sizes, grown)
+                sizes = grown
+        return sizes
 
     def _unused(self, sizes: np.ndarray, scales: np.ndarray) -> str | None:
         """Return a sentence about options of anisotropy that differ from the defaults but made no difference to the
@@ -204,8 +206,8 @@ class Upscale(HostEvent):
         if not names:
             return None
         # With the largest cap, because at `self.cap` both rules may give the same size.
-        by_rule = next_sizes(sizes, scales, k_a=self.k_a, k_s=self.k_s, cap=MAX_SIDE, axes=self.axes)
-        doubled = next_sizes(sizes, scales, k_a=self.k_a, k_s=self.k_s, cap=MAX_SIDE, anisotropic=False)
+        by_rule = self._proposed(sizes, scales, True, MAX_SIDE)
+        doubled = self._proposed(sizes, scales, False, MAX_SIDE)
         if (by_rule != doubled).any():
             return None
         return f"{' and '.join(names)} made no difference: no Gaussian whose texture grew was elongated and thin"
