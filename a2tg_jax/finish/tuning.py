@@ -18,6 +18,7 @@ from jax import Array
 
 from a2tg_jax import (
     AdamState,
+    Appearance,
     Change,
     Correction,
     DivergedError,
@@ -80,32 +81,37 @@ TUNED_LADDER: Ladder = MappingProxyType({group: (*COARSER.get(group, ()), *steps
 
 
 class Steps(NamedTuple):
-    """Even steps from the first one on, of numbers x or of asinh((x − centre) / spread) (`io.columns.AxisSteps`)."""
+    """Even steps from the first one on."""
 
     first: Any
     size: Any
     last: Any  # Number of the last step, from 0.
-    contraction: tuple[Any, ...]  # Centre and spread, or ().
 
     @classmethod
-    def of(cls, ends: Sequence[float], bits: int) -> Self:
-        """Return 2^bits steps between two ends, or one if they are equal; centre and spread may precede them."""
-        *contraction, low, high = ends
+    def between(cls, low: float, high: float, bits: int) -> Self:
+        """Return 2^bits steps between two ends, or one if they are equal."""
         last = (1 << bits) - 1
-        if high > low:
-            return cls(low, (high - low) / last, last, tuple(contraction))
         # Size 1 instead of 0: it divides.
-        return cls(low, 1.0, 0, tuple(contraction))
+        return cls(low, (high - low) / last, last) if high > low else cls(low, 1.0, 0)
 
     def nearest(self, values: Array) -> Array:
         """Return the nearest step to each number."""
-        if self.contraction:
-            centre, spread = self.contraction
-            contracted = self._replace(contraction=()).nearest(jnp.arcsinh((values - centre) / spread))
-            nearest: Array = centre + spread * jnp.sinh(contracted)
-        else:
-            nearest = self.first + self.size * jnp.round(jnp.clip((values - self.first) / self.size, 0, self.last))
+        nearest: Array = self.first + self.size * jnp.round(jnp.clip((values - self.first) / self.size, 0, self.last))
         return nearest.astype(values.dtype)
+
+
+class AxisSteps(NamedTuple):
+    """Even steps of asinh((x − centre) / spread) (`io.columns.AxisSteps`)."""
+
+    centre: Any
+    spread: Any
+    steps: Steps
+
+    def nearest(self, x: Array) -> Array:
+        """Return the nearest step to each number."""
+        contracted = self.steps.nearest(jnp.arcsinh((x - self.centre) / self.spread))
+        nearest: Array = self.centre + self.spread * jnp.sinh(contracted)
+        return nearest.astype(x.dtype)
 
 
 @pytree
@@ -113,7 +119,7 @@ class GridRounding:
     """Rounding to the grids of a compact file, for models that `half_turned` made: no splat is turned again."""
 
     steps: dict[str, Any]
-    """Steps by the name of the part of the file; a part kept as floats has none. Means have three, by axis."""
+    """Steps by the name of the part of the file; a part kept as floats has none. Means have three `AxisSteps`."""
 
     @classmethod
     def to(cls, grids: Grids, choices: CompactChoices) -> Self:
@@ -123,59 +129,65 @@ class GridRounding:
             bits = choices.of_part(name)
             assert isinstance(bits, int)
             if name == "means":
-                steps[name] = tuple(Steps.of(ends[at : at + 4], bits) for at in (0, 4, 8))
+                steps[name] = [
+                    AxisSteps(centre, spread, Steps.between(low, high, bits))
+                    for centre, spread, low, high in (ends[:4], ends[4:8], ends[8:])
+                ]
             else:
-                steps[name] = Steps.of(ends, bits)
+                low, high = ends
+                steps[name] = Steps.between(low, high, bits)
         return cls(steps)
 
     def __call__(self, model: Model) -> Model:
         """Return the model in the file, its rows in the given order; traced."""
-        gaussians = model.gaussians
-        shown = model.appearance
-        steps = self.steps
+        gaussians = self._gaussians(model.gaussians)
+        return dataclasses.replace(model, gaussians=gaussians, appearance=self._appearance(model))
 
-        def nearest(name: str, values: Array) -> Array:
-            return steps[name].nearest(values) if name in steps else values
-
-        def bands(blocks: Array, first: int) -> Array:
-            """Round blocks [M, K, 3] of the bands from degree `first` on, each on its own grid."""
-            rounded = [blocks[:, :0]]
-            start = 0
-            for degree in range(first, MAX_DEGREE + 1):
-                if start < blocks.shape[1]:
-                    rounded.append(nearest(f"sh_{degree}", blocks[:, start : start + 2 * degree + 1]))
-                    start += 2 * degree + 1
-            return jnp.concatenate(rounded, axis=1)
-
-        def texels(bucket: Array) -> Array:
-            parts = (nearest("texel_colors", bucket[..., :3]), nearest("texel_alphas", bucket[..., 3:]))
-            return jnp.concatenate(parts, axis=-1)
-
+    def _gaussians(self, gaussians: Gaussians) -> Gaussians:
         means = gaussians.means
-        if "means" in steps:
-            means = jnp.stack([of_axis.nearest(means[:, axis]) for axis, of_axis in enumerate(steps["means"])], 1)
+        if "means" in self.steps:
+            means = jnp.stack([axis.nearest(x) for axis, x in zip(self.steps["means"], means.T, strict=True)], 1)
         quats = gaussians.quats
-        if "quats" in steps:
-            quats = _with_w(nearest("quats", _xyz(quats)))
+        if "quats" in self.steps:
+            quats = _with_w(self._nearest("quats", _xyz(quats)))
         logits = gaussians.logit_opacities
-        if "opacities" in steps:
+        if "opacities" in self.steps:
             # The file has steps of opacities, not of logits.
-            opacities = nearest("opacities", jax.nn.sigmoid(logits))
+            opacities = self._nearest("opacities", jax.nn.sigmoid(logits))
             logits = logit(jnp.clip(opacities, LEAST_OPACITY, 1 - LEAST_OPACITY))
-        log_scales = nearest("log_scales", gaussians.log_scales)
+        log_scales = self._nearest("log_scales", gaussians.log_scales)
+        return Gaussians(means, quats, log_scales, logits, self._bands(gaussians.sh, 0))
+
+    def _appearance(self, model: Model) -> Appearance:
+        shown = model.appearance
         table = shown.coefficients
         if table is not None:
-            buckets = tuple(bands(blocks, gaussians.sh_degree + 1) for blocks in table.buckets)
+            buckets = tuple(self._bands(blocks, model.gaussians.sh_degree + 1) for blocks in table.buckets)
             shown = shown.with_coefficients(dataclasses.replace(table, buckets=buckets))
         textures = shown.textures
         if textures is not None:
-            shown = shown.with_textures(dataclasses.replace(textures, buckets=tuple(map(texels, textures.buckets))))
-        if shown.exponents is not None and "shapes" in steps:
+            rounded = []
+            for bucket in textures.buckets:
+                colors = self._nearest("texel_colors", bucket[..., :3])
+                alphas = self._nearest("texel_alphas", bucket[..., 3:])
+                rounded.append(jnp.concatenate([colors, alphas], axis=-1))
+            shown = shown.with_textures(dataclasses.replace(textures, buckets=tuple(rounded)))
+        if shown.exponents is not None and "shapes" in self.steps:
             # The file has steps of logarithms.
-            rounded_exponents = Exponents.of_logarithms(nearest("shapes", shown.exponents.logarithms))
-            shown = dataclasses.replace(shown, exponents=rounded_exponents)
-        rounded = Gaussians(means, quats, log_scales, logits, bands(gaussians.sh, 0))
-        return dataclasses.replace(model, gaussians=rounded, appearance=shown)
+            logarithms = self._nearest("shapes", shown.exponents.logarithms)
+            shown = dataclasses.replace(shown, exponents=Exponents.of_logarithms(logarithms))
+        return shown
+
+    def _nearest(self, name: str, values: Array) -> Array:
+        return self.steps[name].nearest(values) if name in self.steps else values
+
+    def _bands(self, blocks: Array, first: int) -> Array:
+        """Round blocks [M, K, 3] of the bands from degree `first` on, each on its own grid."""
+        rounded = [blocks[:, :0]]
+        for degree in range(first, MAX_DEGREE + 1):
+            start = degree**2 - first**2
+            rounded.append(self._nearest(f"sh_{degree}", blocks[:, start : start + 2 * degree + 1]))
+        return jnp.concatenate(rounded, axis=1)
 
 
 def _xyz(quats: Array) -> Array:
