@@ -16,7 +16,7 @@ from a2tg_jax.appearance.parts import nearest_gaussians
 from a2tg_jax.results.model_source import check_init, write_first_stage
 from a2tg_jax.results.record import RunRecord, SceneSource
 from a2tg_jax.training.cost import forecast_stages
-from a2tg_jax.training.start import padded
+from a2tg_jax.training.start import padded, state_of_model
 
 NUM = 40
 SHAPES = np.linspace(-1, 1, NUM).astype(np.float32)
@@ -94,8 +94,9 @@ def test_bytes_of_shapes_count_in_a_budget(tmp_path, scene):
 
 def test_a_stage_without_shapes_takes_the_nearest_gaussians():
     stage = OF_GAUSSIANS.stages()[1]
-    with pytest.warns(UserWarning, match="^stage 'details' has no shapes of kernels: it takes the Gaussians nearest"):
-        found = padded(shaped(), stage, OF_GAUSSIANS)
+    with pytest.warns(UserWarning, match="^stage 'details' has no shapes of kernels: it takes the") as caught:
+        found = state_of_model(shaped(), stage, OF_GAUSSIANS, ()).model
+    assert caught[0].filename == __file__, "the line that called the package"
     nearest = nearest_gaussians(GAUSSIANS, SHAPES)
     jax.tree.map(np.testing.assert_array_equal, found.live.gaussians, nearest)
     assert not np.allclose(nearest.log_scales, GAUSSIANS.log_scales)

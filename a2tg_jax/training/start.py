@@ -1,8 +1,7 @@
 """Start of a stage: Gaussians at a scene's points, or a given model; and its state, with room for what events add."""
 
 import dataclasses
-import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, TypeVar
 
 import jax
@@ -14,6 +13,7 @@ from a2tg_jax.appearance import Appearance, allocate_appearance
 from a2tg_jax.appearance.base import check_appearance, join_rows, without_arrays
 from a2tg_jax.appearance.parts import Part, nearest_gaussians
 from a2tg_jax.base.checks import fields_of
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import INITIAL_OPACITY, Gaussians, init_from_points, no_rows
 from a2tg_jax.core.geometry import FILTER_VARIANCE, pixel_sizes
@@ -94,10 +94,9 @@ def start_colors(scene: Scene) -> np.ndarray:
     if len(colors) < 2 or (colors != colors[0]).any() or (np.abs(colors[0] - GREY) < GREY_SLACK).all():
         return colors
     color = ", ".join(f"{number:g}" for number in colors[0].round(3).tolist())
-    warnings.warn(
+    warn(
         f"all {len(colors):,} points of {scene.name} have one colour ({color}): taken as points without colours, "
-        "which start grey",
-        stacklevel=3,
+        "which start grey"
     )
     return np.full_like(colors, GREY)
 
@@ -159,26 +158,12 @@ def given_model(start: Model, scene: Scene, system: System, index: int) -> Model
     start = start[:]
     stages = system.all_stages()
     stage = stages[index]
+    _check_given_number(start.num, stage, system, is_first=index == 0)
+    _check_given_place(start, scene)
     degree = system.initial_sh_degree
-    num = start.num
-    _check_given_number(num, stage, system, is_first=index == 0)
-    if index == 0 and system.initial_gaussians not in (None, num):
-        warnings.warn(
-            f"initial_gaussians of {system.initial_gaussians:,} does not apply: training starts from the {num:,} "
-            "Gaussians of start",
-            stacklevel=4,
-        )
-    transform = scene.transform if start.origin is None else start.origin.transform
-    if not _are_close(transform, scene.transform):
-        warnings.warn(
-            "start was made in another world than the scene's, so that its Gaussians are elsewhere: give "
-            "start.transform(start.origin.transform.inverse().then(scene.transform))",
-            stacklevel=4,
-        )
-    _check_seen("start.gaussians.means", np.asarray(start.gaussians.means), scene)
-    template = start.appearance.template
     # The appearance of the stage before is expected as well: this stage replaces it, such as textures by others.
-    is_expected = template == stage.appearance or (index > 0 and template == stages[index - 1].appearance)
+    expected = (stage.appearance, stages[max(index - 1, 0)].appearance)
+    is_expected = start.appearance.template in expected
     if is_expected and start.gaussians.sh_degree == degree:
         return start
     if is_expected and start.appearance.coefficients is not None:
@@ -188,18 +173,19 @@ def given_model(start: Model, scene: Scene, system: System, index: int) -> Model
         )
     lost = left_out(start, degree, None if is_expected else stage.appearance)
     if lost:
-        warnings.warn(f"start: stage {stage.name!r} leaves out {' and '.join(lost)}", stacklevel=4)
-    if is_expected:
-        return dataclasses.replace(start, gaussians=with_degree(start.gaussians, degree))
-    keeps_shapes = stage.appearance.exponents is not None
-    gaussians = with_degree(plain_gaussians(start, keeps_shapes=keeps_shapes), degree)
-    return dataclasses.replace(
-        start, gaussians=gaussians, appearance=start.appearance if keeps_shapes else Appearance()
-    )
+        warn(f"start: stage {stage.name!r} leaves out {' and '.join(lost)}")
+    gaussians = start.gaussians
+    appearance = start.appearance
+    if not is_expected:
+        keeps_shapes = stage.appearance.exponents is not None
+        gaussians = plain_gaussians(start, keeps_shapes=keeps_shapes)
+        appearance = appearance if keeps_shapes else Appearance()
+    return dataclasses.replace(start, gaussians=with_degree(gaussians, degree), appearance=appearance)
 
 
 def _check_given_number(num: int, stage: Stage, system: System, *, is_first: bool) -> None:
-    """Raise ValueError, naming the option, unless a stage can start from a number of given Gaussians."""
+    """Raise ValueError, naming the option, unless a stage can start from a number of given Gaussians. Warn if that is
+    not the number that was asked for."""
     if num < LEAST_LEFT:
         raise ValueError(f"start must have at least {LEAST_LEFT} Gaussians; got {num}")
     if not is_first:
@@ -207,14 +193,27 @@ def _check_given_number(num: int, stage: Stage, system: System, *, is_first: boo
             system.check_given_number(num)
         return
     system.check_initial_number(num)
-    for event in stage.events:
-        most = event.most_gaussians
-        if most is not None and num > most:
-            limit = _limit_of(event, system)
-            raise ValueError(
-                f"start must have at most {most:,} Gaussians, for which {limit} has room; got {num:,}: raise {limit}, "
-                f"or start from some of them, such as start[:{most}]"
-            )
+    for most, limit in _exceeded(stage, num, system):
+        raise ValueError(
+            f"start must have at most {most:,} Gaussians, for which {limit} has room; got {num:,}: raise {limit}, "
+            f"or start from some of them, such as start[:{most}]"
+        )
+    if system.initial_gaussians not in (None, num):
+        warn(
+            f"initial_gaussians of {system.initial_gaussians:,} does not apply: training starts from the {num:,} "
+            "Gaussians of start"
+        )
+
+
+def _check_given_place(start: Model, scene: Scene) -> None:
+    """Raise ValueError if no training view sees a given model. Warn if its world is not the scene's."""
+    transform = scene.transform if start.origin is None else start.origin.transform
+    if not _are_close(transform, scene.transform):
+        warn(
+            "start was made in another world than the scene's, so that its Gaussians are elsewhere: give "
+            "start.transform(start.origin.transform.inverse().then(scene.transform))"
+        )
+    _check_seen("start.gaussians.means", np.asarray(start.gaussians.means), scene)
 
 
 def left_out(model: Model, degree: int, template: Appearance | None) -> list[str]:
@@ -318,6 +317,14 @@ def _limit_of(event: Event, system: System) -> str:
     return f"{system.path_of(event)}.{event.limited_by}" if system.memory_budget is None else "memory_budget"
 
 
+def _exceeded(stage: Stage, num: int, system: System) -> Iterator[tuple[int, str]]:
+    """Yield the bounds of a stage's events that a number of Gaussians exceeds, and the options that set them."""
+    for event in stage.events:
+        most = event.most_gaussians
+        if most is not None and num > most:
+            yield most, _limit_of(event, system)
+
+
 def rows_needed(stage: Stage, num: int, system: System) -> int:
     """Return the rows that a stage allocates for `num` Gaussians. ValueError: naming the options to change, if an event
     cannot reach its number."""
@@ -344,23 +351,14 @@ def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> 
     takes the nearest Gaussians, with a warning. The number of devices divides the number of rows. ValueError: if
     Gaussians would be added to a model whose textures have grown.
     """
+    num = model.num_rows
+    for most, limit in _exceeded(stage, num, system):
+        warn(f"stage {stage.name!r} begins with {num:,} Gaussians, more than the {limit} of {most:,}: none is added")
+    room = -(-rows_needed(stage, num, system) // num_devices) * num_devices
     gaussians = model.gaussians
     shapes = model.appearance.shapes
-    num = model.num_rows
-    for event in stage.events:
-        most = event.most_gaussians
-        if most is not None and num > most:
-            warnings.warn(
-                f"stage {stage.name!r} begins with {num:,} Gaussians, more than the {_limit_of(event, system)} of "
-                f"{most:,}: none is added",
-                stacklevel=2,
-            )
-    room = -(-rows_needed(stage, num, system) // num_devices) * num_devices
     if shapes is not None and stage.appearance.exponents is None:
-        warnings.warn(
-            f"stage {stage.name!r} has no shapes of kernels: it takes the Gaussians nearest to the model's kernels",
-            stacklevel=2,
-        )
+        warn(f"stage {stage.name!r} has no shapes of kernels: it takes the Gaussians nearest to the model's kernels")
         gaussians = nearest_gaussians(gaussians, np.asarray(shapes))
     if room > num:
         spare = no_rows(room - num, gaussians.sh.shape[1], gaussians.means.dtype)
@@ -397,10 +395,9 @@ def _kept_fields(before: Appearance, allocated: Appearance, stage: Stage) -> dic
             if _shapes(old, first) == _shapes(new, first):
                 kept[name] = old
             else:
-                warnings.warn(
+                warn(
                     f"stage {stage.name!r} begins with new {type(allocated).__name__}.{name}: the shape of the model's "
-                    "does not fit",
-                    stacklevel=3,
+                    "does not fit"
                 )
     return kept
 
