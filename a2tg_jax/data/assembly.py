@@ -318,8 +318,7 @@ def _usable_points(cloud: PointCloud, transform: Similarity, source: str) -> Poi
     is_usable[is_usable] = are_somewhere(transform.apply(cloud.points[is_usable]))
     if not is_usable.all():
         left_out = counted(int(np.count_nonzero(~is_usable)), "point")
-        message = f"{source}: {left_out} left out, not finite or beyond ±{LARGEST_COORDINATE:g}"
-        warn(message)
+        warn(f"{source}: {left_out} left out, not finite or beyond ±{LARGEST_COORDINATE:g}")
     points = cloud.points[is_usable]
     warn_of_rounding("points", points, transform, source)
     return PointCloud(transform.apply(points), cloud.colors[is_usable])
@@ -335,8 +334,10 @@ def _seen_points(cloud: PointCloud, train: Sequence[Shot], sights: Sequence[Sigh
     if len(blind) == len(sights):
         return None
     if blind:
-        message = f"{source}: {len(blind)} of {len(sights)} training views see none of its points, such as "
-        warn(f"{message}{train[blind[0]].name}: nothing to start from there")
+        warn(
+            f"{source}: {len(blind)} of {len(sights)} training views see none of its points, such as "
+            f"{train[blind[0]].name}: nothing to start from there"
+        )
     return cloud
 
 

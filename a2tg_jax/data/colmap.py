@@ -158,8 +158,7 @@ def points_in_world_of(path: Path, viewmats: Mapping[str, np.ndarray]) -> PointC
     if shared:
         to_world = _between(np.stack([poses[name] for name in shared]), np.stack([others[name] for name in shared]))
     if to_world is None:
-        message = f"{model}: has other photographs or poses than the scene: its points are not used"
-        warn(message)
+        warn(f"{model}: has other photographs or poses than the scene: its points are not used")
         return None
     cloud = _start_cloud(model, contents)
     return PointCloud(to_world.apply(cloud.points), cloud.colors)

@@ -239,8 +239,7 @@ def _read_text(file: BinaryIO, path: Path, kind: str) -> Any:
                 f"{path}: line {number} cannot be read ({shortened(str(error))}); export the model again"
             ) from None
     if announced not in (None, len(records)):
-        message = f"{path}: says that it has {announced} {kind}, and has {len(records)}: if it is cut off, export it"
-        warn(f"{message} again")
+        warn(f"{path}: says that it has {announced} {kind}, and has {len(records)}: if it is cut off, export it again")
     return np.array(records, POINT) if kind == "points3D" else records
 
 

@@ -172,8 +172,7 @@ def _record3d_frames(file: Path) -> Frames:
     check_images(file, frames, [str(number) for number in range(len(poses)) if number not in images], nothing)
     unposed = [image.name for number, image in images.items() if number >= len(poses)]
     if unposed:
-        message = f"{file}: {len(unposed)} of {len(images)} images have no pose, such as {unposed[0]}: not used"
-        warn(message)
+        warn(f"{file}: {len(unposed)} of {len(images)} images have no pose, such as {unposed[0]}: not used")
     return Frames(file, frames)
 
 

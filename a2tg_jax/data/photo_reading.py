@@ -169,94 +169,7 @@ def read_photos(
     return [shot for shot, _ in read]
 
 
-def _warn_of_unused_masks(photos: Sequence[Photo]) -> None:
-    """Warn of folders that may hold masks, for a scene without any."""
-    folders = {photo.below_images[0].with_name(MASKS) for photo in photos if photo.below_images}
-    for folder in filter(Path.is_dir, folders):
-        message = f"{folder}: holds no mask of a photograph of the scene, called NAME.jpg.png or NAME.png: not used"
-        warn(message)
-    for root in {folder.parent for folder in folders}:
-        for folder in sorted(root.glob("*[mM]ask*/")):
-            if not folder.name.startswith(MASKS):
-                warn(f"{folder}: not read; if it holds masks, rename it to {MASKS}")
-
-
-def warn_of_lacking_masks(place: Path, lacking: Sequence[str], num: int) -> None:
-    """Warn of the photographs, among `num`, that have no mask although others have."""
-    if lacking:
-        message = f"{place}: {len(lacking)} of {num} photographs have no mask, such as {lacking[0]}"
-        warn(f"{message}: all of their pixels count")
-
-
-def warn_of_grey(grey: Sequence[Path], masks: Sequence[Path]) -> None:
-    """Warn of masks with areas that are neither black nor white, among all masks."""
-    if grey:
-        warn(
-            f"{grey[0].parent}: {len(grey)} of {len(masks)} masks have areas that are neither black nor white, such as "
-            f"{grey[0].name}: pixels above an eighth of the largest level count; make a mask black where pixels must "
-            "not count, and white elsewhere"
-        )
-
-
-def _read(files: _Files, options: SceneOptions, shelf: Shelf) -> tuple[Shot, Path | None]:
-    """Read a photograph, and undistort and downscale it. Also return its mask file if that has areas that are neither
-    black nor white."""
-    photo = files.photo
-    photograph = read_pixels(files.image)
-    height, width = photograph.shape[:2]
-    stored = (width, height)
-    lens = _lens_of(files, stored, options.downscale)
-    try:
-        size, K = lens.view_of(stored, files.downscale)
-        rays = lens.rays(*size)
-    except ValueError as error:
-        raise ValueError(f"{photo.what}: its camera model {error}") from None
-    mask = None if files.mask is None else read_mask(files.mask, stored, lens.size)
-    pixels = photograph
-    if mask is not None and options.mask_as == "background":
-        pixels = _cut_out(photograph, mask.counts)
-    pixels = lens.view_pixels(pixels, files.downscale)
-    counted = []
-    if mask is not None and options.mask_as == "ignored":
-        counted.append(_view_mask(mask.counts, files.mask_downscale, lens, size))
-    if mask is None and photo.counted is not None:
-        counted.append(photo.counted(pixels))
-    if options.alpha == "mask" and pixels.shape[2] == 4:
-        counted.append(pixels[..., 3] == 255)
-        pixels = np.ascontiguousarray(pixels[..., :3])  # A view would keep the alpha channel in memory.
-    shot = Shot(
-        photo.name,
-        photo.viewmat,
-        K,
-        shelf.keep(pixels, files.image if pixels is photograph else None),
-        Mask.of(np.logical_and.reduce(counted)) if counted else None,
-        rays,
-        None if files.depths is None else _depth_map(files.depths, lens, stored, size),
-        photo.panorama,
-    )
-    return shot, files.mask if mask is not None and mask.has_grey_areas else None
-
-
-def _lens_of(files: _Files, stored: tuple[int, int], downscale: int) -> Lens:
-    """Return the lens of a photograph whose file is of a size (width, height); ValueError: of another aspect."""
-    lens = files.photo.lens
-    if not isinstance(lens, Lens):
-        full = stored
-        if files.downscale < downscale:  # The file is a smaller copy, and the full image may be missing.
-            original = find_image(*files.photo.image)
-            full = (downscale * stored[0], downscale * stored[1]) if original is None else picture_size(original)
-        lens = lens(full)
-    width, height = stored
-    camera_width, camera_height = lens.size
-    ratio = (width * camera_height) / (height * camera_width)
-    if abs(ratio - 1) > max(MAX_ASPECT_ERROR, 1 / min(stored)):  # Or a pixel of the shorter side.
-        is_turned = (height, width) == lens.size
-        advice = "write it turned as EXIF says (magick mogrify -auto-orient FILE), or " if is_turned else ""
-        raise ValueError(
-            f"{files.image}: is {width}x{height}, but its camera is {camera_width}x{camera_height}, of another aspect; "
-            f"{advice}use the image that the camera was estimated from"
-        )
-    return lens
+# Files of photographs
 
 
 def _find_files(
@@ -371,6 +284,79 @@ def mask_names(name: str) -> tuple[str, str, str]:
     return f"{name}.png", str(Path(name).with_suffix(".png")), name
 
 
+def find_depths(images: Path, name: str) -> Path | None:
+    """Return the depth map of an image below a folder: NAME.npy, NAME.png, NAME.EXT.npy or NAME.EXT.png in the sibling
+    folder `depths`; None if there is none.
+    """
+    stem = Path(name).with_suffix("")
+    names = (f"{stem}.npy", f"{name}.npy", f"{stem}.png", f"{name}.png")
+    return on_disk(images.with_name(DEPTHS), *names)
+
+
+# Photographs
+
+
+def _read(files: _Files, options: SceneOptions, shelf: Shelf) -> tuple[Shot, Path | None]:
+    """Read a photograph, and undistort and downscale it. Also return its mask file if that has areas that are neither
+    black nor white."""
+    photo = files.photo
+    photograph = read_pixels(files.image)
+    height, width = photograph.shape[:2]
+    stored = (width, height)
+    lens = _lens_of(files, stored, options.downscale)
+    try:
+        size, K = lens.view_of(stored, files.downscale)
+        rays = lens.rays(*size)
+    except ValueError as error:
+        raise ValueError(f"{photo.what}: its camera model {error}") from None
+    mask = None if files.mask is None else read_mask(files.mask, stored, lens.size)
+    pixels = photograph
+    if mask is not None and options.mask_as == "background":
+        pixels = _cut_out(photograph, mask.counts)
+    pixels = lens.view_pixels(pixels, files.downscale)
+    counted = []
+    if mask is not None and options.mask_as == "ignored":
+        counted.append(_view_mask(mask.counts, files.mask_downscale, lens, size))
+    if mask is None and photo.counted is not None:
+        counted.append(photo.counted(pixels))
+    if options.alpha == "mask" and pixels.shape[2] == 4:
+        counted.append(pixels[..., 3] == 255)
+        pixels = np.ascontiguousarray(pixels[..., :3])  # A view would keep the alpha channel in memory.
+    shot = Shot(
+        photo.name,
+        photo.viewmat,
+        K,
+        shelf.keep(pixels, files.image if pixels is photograph else None),
+        Mask.of(np.logical_and.reduce(counted)) if counted else None,
+        rays,
+        None if files.depths is None else _depth_map(files.depths, lens, stored, size),
+        photo.panorama,
+    )
+    return shot, files.mask if mask is not None and mask.has_grey_areas else None
+
+
+def _lens_of(files: _Files, stored: tuple[int, int], downscale: int) -> Lens:
+    """Return the lens of a photograph whose file is of a size (width, height); ValueError: of another aspect."""
+    lens = files.photo.lens
+    if not isinstance(lens, Lens):
+        full = stored
+        if files.downscale < downscale:  # The file is a smaller copy, and the full image may be missing.
+            original = find_image(*files.photo.image)
+            full = (downscale * stored[0], downscale * stored[1]) if original is None else picture_size(original)
+        lens = lens(full)
+    width, height = stored
+    camera_width, camera_height = lens.size
+    ratio = (width * camera_height) / (height * camera_width)
+    if abs(ratio - 1) > max(MAX_ASPECT_ERROR, 1 / min(stored)):  # Or a pixel of the shorter side.
+        is_turned = (height, width) == lens.size
+        advice = "write it turned as EXIF says (magick mogrify -auto-orient FILE), or " if is_turned else ""
+        raise ValueError(
+            f"{files.image}: is {width}x{height}, but its camera is {camera_width}x{camera_height}, of another aspect; "
+            f"{advice}use the image that the camera was estimated from"
+        )
+    return lens
+
+
 def _view_mask(counts: np.ndarray, downscale: int, lens: Lens, view_size: tuple[int, int]) -> np.ndarray:
     """Return the mask [H, W] of a view of (width, height), undistorted and downscaled as its photograph was.
 
@@ -390,6 +376,9 @@ def _cut_out(pixels: np.ndarray, counts: np.ndarray) -> np.ndarray:
     counts = np.asarray(Image.fromarray(counts).resize(size, Image.Resampling.NEAREST))
     opacities = pixels[..., 3] if pixels.shape[2] == 4 else np.uint8(255)
     return np.dstack([pixels[..., :3], np.where(counts, opacities, np.uint8(0))])
+
+
+# Masks
 
 
 class MaskFile(NamedTuple):
@@ -440,13 +429,37 @@ def _divided(levels: np.ndarray) -> MaskFile:
     return MaskFile(levels > white / 2, 1 < white < HALF and black > 0)
 
 
-def find_depths(images: Path, name: str) -> Path | None:
-    """Return the depth map of an image below a folder: NAME.npy, NAME.png, NAME.EXT.npy or NAME.EXT.png in the sibling
-    folder `depths`; None if there is none.
-    """
-    stem = Path(name).with_suffix("")
-    names = (f"{stem}.npy", f"{name}.npy", f"{stem}.png", f"{name}.png")
-    return on_disk(images.with_name(DEPTHS), *names)
+def _warn_of_unused_masks(photos: Sequence[Photo]) -> None:
+    """Warn of folders that may hold masks, for a scene without any."""
+    folders = {photo.below_images[0].with_name(MASKS) for photo in photos if photo.below_images}
+    for folder in filter(Path.is_dir, folders):
+        warn(f"{folder}: holds no mask of a photograph of the scene, called NAME.jpg.png or NAME.png: not used")
+    for root in {folder.parent for folder in folders}:
+        for folder in sorted(root.glob("*[mM]ask*/")):
+            if not folder.name.startswith(MASKS):
+                warn(f"{folder}: not read; if it holds masks, rename it to {MASKS}")
+
+
+def warn_of_lacking_masks(place: Path, lacking: Sequence[str], num: int) -> None:
+    """Warn of the photographs, among `num`, that have no mask although others have."""
+    if lacking:
+        warn(
+            f"{place}: {len(lacking)} of {num} photographs have no mask, such as {lacking[0]}: all of their pixels "
+            "count"
+        )
+
+
+def warn_of_grey(grey: Sequence[Path], masks: Sequence[Path]) -> None:
+    """Warn of masks with areas that are neither black nor white, among all masks."""
+    if grey:
+        warn(
+            f"{grey[0].parent}: {len(grey)} of {len(masks)} masks have areas that are neither black nor white, such as "
+            f"{grey[0].name}: pixels above an eighth of the largest level count; make a mask black where pixels must "
+            "not count, and white elsewhere"
+        )
+
+
+# Depth maps
 
 
 def _depth_map(file: Path, lens: Lens, stored: tuple[int, int], size: tuple[int, int]) -> DepthMap:

@@ -98,8 +98,7 @@ def _split_by_lists(file: Path, shots: Sequence[Shot], lists: dict[str, set[str]
     unused = sorted(names - train_names - test_names)
     if unused:
         only = "; val_filenames count only without test_filenames" if val_names else ""
-        message = f"{len(unused)} of {len(names)} frames are in no list that is used, such as {unused[0]}{only}"
-        warn(f"{file}: {message}")
+        warn(f"{file}: {len(unused)} of {len(names)} frames are in no list that is used, such as {unused[0]}{only}")
     train = [shot for shot in shots if shot.name in train_names]
     return train, [shot for shot in shots if shot.name in test_names]
 
@@ -161,8 +160,10 @@ def check_images(file: Path, frames: Sequence[object], lacking: Sequence[str], n
     if not frames:
         raise ValueError(nothing)
     if lacking:
-        message = f"{file}: {len(lacking)} of {len(frames) + len(lacking)} cameras have no image beside them, such as "
-        warn(f"{message}{shortened(lacking[0])}: not used")
+        warn(
+            f"{file}: {len(lacking)} of {len(frames) + len(lacking)} cameras have no image beside them, such as "
+            f"{shortened(lacking[0])}: not used"
+        )
 
 
 def _points_beside(file: Path, metas: Sequence[dict[str, Any]], shots: Sequence[Shot]) -> PointCloud | None:

@@ -231,8 +231,7 @@ def _model_of(document: Document, primitive: Mapping[str, Any]) -> Model:
     for name in ("kernel", "colorSpace"):
         value = described.get(name)
         if value != DESCRIBED[name]:
-            message = f"its splats have the {name} {shortened(value)}; they are read as {DESCRIBED[name]}"
-            warn(f"{document.path}: {message}")
+            warn(f"{document.path}: its splats have the {name} {shortened(value)}; they are read as {DESCRIBED[name]}")
     extras = primitive.get("extras", {})
     kept = extras.get(OWN, {}) if isinstance(extras, dict) else {}
     origin = origin_of(kept["origin"], kept["origin"]) if "origin" in kept else None

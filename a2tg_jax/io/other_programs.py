@@ -216,10 +216,10 @@ def writer_as(kind: Kind, encode: Callable[[PlacedSplats], bytes]) -> Callable[.
         check_model(Model(gaussians))  # Never write a file that would not load.
         check_positions(kind, gaussians, path)
         means = np.asarray(gaussians.means, np.float64)
-        low = means.min(axis=0)
-        high = means.max(axis=0)
-        # 1e-30: all means may be equal along an axis.
-        codes = ((means - low) / np.maximum(high - low, 1e-30) * (2**CURVE_BITS - 1)).astype(np.int64)
+        above = means - means.min(axis=0)
+        # All means may be equal along an axis.
+        shares = above / np.maximum(above.max(axis=0), LEAST_SCALE)
+        codes = (shares * (2**CURVE_BITS - 1)).astype(np.int64)
         # Stable: equal codes keep their order, so that files repeat.
         splats = splats_of(Model(gaussians[np.argsort(morton(codes.T, CURVE_BITS), kind="stable")]))
         # Formats that round scales by a table then spend one entry on the third.
@@ -344,11 +344,10 @@ def flat_rows(name: str, rows: FileRows, *, keeps_all: bool = False) -> FileRows
     lengths = np.linalg.norm(quats.astype(np.float64), axis=1)
     unrotated = np.flatnonzero(lengths == 0)
     if len(unrotated):
-        message = (
+        warn(
             f"{name}: {counted(len(unrotated), 'Gaussian')} of {len(lengths):,} with the rotation 0 0 0 0, read as "
             f"unrotated; the first is row {unrotated[0]:,} (from 0)"
         )
-        warn(message)
         quats[unrotated] = [1, 0, 0, 0]
     # The squares of these leave the range of float32.
     is_extreme = ((lengths > 0) & (lengths < LEAST_LENGTH)) | (np.isfinite(lengths) & (lengths > 1 / LEAST_LENGTH))
@@ -391,12 +390,11 @@ def drawable_rows(name: str, rows: FileRows) -> np.ndarray:
     if not is_drawable.any():
         return np.ones(num, bool)
     if what:
-        message = (
+        warn(
             f"{name}: {counted(num - int(is_drawable.sum()), 'Gaussian')} of {num:,} left out, with numbers that are "
             f"NaN, infinite or too large to draw (beyond ±{LARGEST_NUMBER:g}); the first is row {first:,} (from 0), "
             f"with {what}"
         )
-        warn(message)
     return is_drawable
 
 
@@ -436,8 +434,7 @@ def flattened(quats: np.ndarray, log_scales: np.ndarray, name: str) -> tuple[np.
     # Files of `save_ply` have a third scale of 1 THICKNESS, which must not warn.
     num_thick = np.count_nonzero(dropped > kept.min(axis=1) + np.log(2 * THICKNESS))
     if num_thick:
-        message = f"{name}: holds 3D Gaussians (scale_2), {num_thick} of them not flat; their thinnest axis is dropped"
-        warn(message)
+        warn(f"{name}: holds 3D Gaussians (scale_2), {num_thick} of them not flat; their thinnest axis is dropped")
     # The product of quaternions: the turn of the axes first, then the splat's own rotation.
     w, x, y, z = quats.T
     a, b, c, d = AXES_TO_NORMAL[thinnest].T
@@ -459,18 +456,16 @@ def warn_of_unread(names: Iterable[str], path: Path) -> None:
     by_stem.pop("f_rest_", None)
     kinds = [alike[0] if len(alike) == 1 else f"{alike[0]} to {alike[-1]}" for alike in by_stem.values()]
     if kinds:
-        message = (
+        warn(
             f"{path}: does not read {first_names(kinds)}; if the program that "
             "wrote the file draws by these attributes, its Gaussians look different here"
         )
-        warn(message)
 
 
 def degree_to_read(degree: int, name: str) -> int:
     """Return the SH degree to read from a file, at most 3. Warn if the file's is higher."""
     if degree > MAX_DEGREE:
-        message = f"{name}: has SH of degree {degree}; degree {MAX_DEGREE} is read, and what is above it left out"
-        warn(message)
+        warn(f"{name}: has SH of degree {degree}; degree {MAX_DEGREE} is read, and what is above it left out")
     return min(degree, MAX_DEGREE)
 
 
@@ -535,33 +530,41 @@ def joined_parts(parts: Iterable[tuple[Model, np.ndarray]], up: Up) -> Model:
         if len(models) == MOST_PARTS:
             raise ValueError(f"holds more than {MOST_PARTS} sets of splats")
         world = similarity_of(matrix, "the transform of its splats")
+        # All parts share a world, so that the first decides.
         if not models:
-            placed = upright(model.origin, up)
-            # In files of version 0.2 and of other programs, +z of the model is up.
-            earlier = Similarity(placed.scale, UPRIGHT[up], np.zeros(3))
-            is_known = model.origin is not None or _is_same(world, placed)
-            if not is_known or _is_same(world, earlier):
-                placed = earlier
-        move = world.then(placed.inverse())
-        # A file written here must come back with the same numbers: rounding in its matrix must not move it.
-        is_same = _is_same(move, UNMOVED)
-        if is_same:
-            move = UNMOVED
-        check_similarity(move, "its transform")
-        # One offset for all parts, by the first: they must share a world.
-        if not models:
-            offset = offset_after("ply", model.gaussians, move)
-        if not is_same or offset.any():
+            placed, is_up_known = _placement(model.origin, world, up)
+            offset = offset_after("ply", model.gaussians, _move_between(world, placed))
+        move = _move_between(world, placed)
+        if move is not UNMOVED or offset.any():
             model = model.transform(dataclasses.replace(move, translation=move.translation - offset))
         models.append(model)
     if not models:
         raise ValueError("holds no splats")
     if models[0].origin is None:
         origin = origin_at(offset)
-        if not is_known:
+        if not is_up_known:
             origin = dataclasses.replace(origin or Origin.of_cameras([]), up=np.array([0.0, 0.0, 1.0]))
         models[0] = dataclasses.replace(models[0], origin=origin)
     return models[0] if len(models) == 1 else concatenate(models)
+
+
+def _placement(origin: Origin | None, world: Similarity, up: Up) -> tuple[Similarity, bool]:
+    """Return the similarity by which a writer placed a model in a file's world, and whether it knew what is up."""
+    placed = upright(origin, up)
+    # In files of version 0.2 and of other programs, +z of the model is up.
+    earlier = Similarity(placed.scale, UPRIGHT[up], np.zeros(3))
+    is_up_known = origin is not None or _is_same(world, placed)
+    return earlier if not is_up_known or _is_same(world, earlier) else placed, is_up_known
+
+
+def _move_between(world: Similarity, placed: Similarity) -> Similarity:
+    """Return the move of a model whose file has it at another place than its writer."""
+    move = world.then(placed.inverse())
+    # A file written here must come back with the same numbers: rounding in its matrix must not move it.
+    if _is_same(move, UNMOVED):
+        return UNMOVED
+    check_similarity(move, "its transform")
+    return move
 
 
 def _is_same(one: Similarity, other: Similarity) -> bool:
@@ -649,11 +652,10 @@ def warn_of_offset(kind: Kind, offset: np.ndarray, path: Path | str) -> None:
     """Warn that the positions of a file are relative to an offset [3], unless it is zero."""
     if offset.any():
         place = OFFSET_PLACES.get(kind, "the file has no place for this: write it down")
-        message = (
+        warn(
             f"{path}: positions are relative to ({', '.join(number_words(offset))}), because the format "
             f"would round such large coordinates too far; {place}"
         )
-        warn(message)
 
 
 def number_words(numbers: np.ndarray) -> list[str]:
@@ -677,8 +679,7 @@ def check_positions(kind: Kind, gaussians: Gaussians, path: Path) -> None:
     rounding = float(np.median(_rounding(kind, means) / scales))
     if rounding > MOST_ROUNDING:
         advice = "write *.ply or *.sog, or enlarge the scene" if kind == "spz" else "write *.ply"
-        message = f"{path}: positions are rounded by {rounding:.2g} times the scale of a typical Gaussian; {advice}"
-        warn(message)
+        warn(f"{path}: positions are rounded by {rounding:.2g} times the scale of a typical Gaussian; {advice}")
 
 
 def _rounding(kind: Kind, means: np.ndarray) -> np.ndarray:
