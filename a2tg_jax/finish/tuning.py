@@ -100,7 +100,7 @@ class Steps(NamedTuple):
         return nearest.astype(values.dtype)
 
 
-class AxisSteps(NamedTuple):
+class ContractedSteps(NamedTuple):
     """Even steps of asinh((x − centre) / spread) (`io.columns.AxisSteps`)."""
 
     centre: Any
@@ -119,7 +119,7 @@ class GridRounding:
     """Rounding to the grids of a compact file, for models that `half_turned` made: no splat is turned again."""
 
     steps: dict[str, Any]
-    """Steps by the name of the part of the file; a part kept as floats has none. Means have three `AxisSteps`."""
+    """Steps by the name of the part of the file; a part kept as floats has none. Means have three `ContractedSteps`."""
 
     @classmethod
     def to(cls, grids: Grids, choices: CompactChoices) -> Self:
@@ -130,7 +130,7 @@ class GridRounding:
             assert isinstance(bits, int)
             if name == "means":
                 steps[name] = [
-                    AxisSteps(centre, spread, Steps.between(low, high, bits))
+                    ContractedSteps(centre, spread, Steps.between(low, high, bits))
                     for centre, spread, low, high in (ends[:4], ends[4:8], ends[8:])
                 ]
             else:

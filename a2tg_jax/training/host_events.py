@@ -5,11 +5,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from a2tg_jax.core.numerics import where_rows
 from a2tg_jax.core.table import map_rows
-from a2tg_jax.events import Change, Due, Event, HostEvent
+from a2tg_jax.events import Due, Event, HostEvent
+from a2tg_jax.model import Model
 from a2tg_jax.training.reports import StageEffects
 from a2tg_jax.training.returned import calling, checked_change
 from a2tg_jax.training.stage import Stage
@@ -65,19 +67,23 @@ class HostEvents:
         state = dataclasses.replace(state, model=change.model, moments=change.moments)
         if change.rows is not None:  # Statistics of other events move along with the Gaussians.
             pairs = zip(self._stage.events, state.events, strict=True)
-            moved = [None if gathered is None else _moved(other, gathered, change) for other, gathered in pairs]
+            moved = [
+                None if gathered is None else _moved(other, gathered, change.rows, change.model)
+                for other, gathered in pairs
+            ]
             state = dataclasses.replace(state, events=tuple(moved))
         return _with_event(state, place, change.state)
 
 
-def _moved(event: Event, gathered: Any, change: Change) -> Any:
-    """Return the state of an event after rows have moved."""
-    moved = event.gather(gathered, change.rows)
-    new = event.init(change.model)
-    if type(event).gather is not Event.gather or jax.tree.structure(new) != jax.tree.structure(moved):
+def _moved(event: Event, gathered: Any, rows: np.ndarray, model: Model) -> Any:
+    """Return the state of an event after rows have moved, given the model with moved rows."""
+    moved = event.gather(gathered, rows)
+    new = event.init(model)
+    is_alike: bool = jax.tree.structure(new) == jax.tree.structure(moved)  # type: ignore[operator]
+    if type(event).gather is not Event.gather or not is_alike:
         return moved
     # Gaussians that are added between steps take the rows of removed ones.
-    is_removed = jnp.arange(change.model.num_rows) >= change.model.live_count
+    is_removed = jnp.arange(model.num_rows) >= model.live_count
 
     def renewed(old: Array, initial: Array) -> Array:
         return where_rows(is_removed, initial, old) if old.ndim else old
