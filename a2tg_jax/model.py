@@ -1,7 +1,6 @@
 """A model: Gaussians and their appearance, as one value that is trained, rendered, counted, moved and saved."""
 
 import dataclasses
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -32,6 +31,7 @@ from a2tg_jax.base.checks import (
 )
 from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.text import counted, in_bytes
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import LARGEST_LOG_SCALE, LARGEST_OPACITY, Gaussians, check_gaussians, logit
@@ -349,7 +349,7 @@ def concatenate(models: Sequence[Model]) -> Model:
             apart = model.origin.transform.inverse().then(first.origin.transform).apply(np.zeros(3))
             if np.abs(apart).max() > SAME_PLACE:
                 move = f"models[{index}].origin.transform.inverse().then(models[0].origin.transform)"
-                warnings.warn(f"models[{index}] is relative to another offset; transform it by {move}", stacklevel=2)
+                warn(f"models[{index}] is relative to another offset; transform it by {move}")
     highest = max(model.gaussians.sh.shape[1] for model in models)
     several = [model.gaussians for model in models]
     if first.appearance.bands is None:

@@ -8,7 +8,6 @@ import collections
 import dataclasses
 import functools
 import threading
-import warnings
 from collections.abc import Callable, Hashable
 from typing import Any, NamedTuple
 
@@ -29,6 +28,7 @@ from a2tg_jax.base.checks import (
     dtype_of,
     plain_array,
 )
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.core.cameras import Camera, check_camera
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
@@ -167,11 +167,10 @@ def _watch(rendered: _Watched, kind: Hashable) -> None:
             continue
         # Explicit transfers, which `jax.transfer_guard` lets pass.
         if jax.device_get(done.overflow):
-            warnings.warn(
+            warn(
                 f"settings.capacity of {done.capacity:,} was too small for a render: its image is only the background. "
                 "Plan it with settings = plan_render(model, cameras), or leave capacity=None outside jit",
                 CapacityWarning,
-                stacklevel=4,
             )
         if done.has_rows and jax.device_get(done.num_pairs) == 0:
             warn_of_empty("the camera of a render")

@@ -66,7 +66,7 @@ def plan_render(
     model = _model_of(gaussians, appearance, textures, settings)
     most = most_pairs(model.gaussians, cameras, model.appearance, settings, model.num_live)
     if most == 0 and has_rows(model.gaussians, model.num_live):
-        warn_of_empty("any of the cameras", stacklevel=3)
+        warn_of_empty("any of the cameras")
     return dataclasses.replace(settings, capacity=TileRoom().plan(None, most, head_room))
 
 

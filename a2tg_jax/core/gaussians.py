@@ -5,7 +5,6 @@ N is the number of Gaussians; quaternions are wxyz and need not be unit.
 
 import dataclasses
 import math
-import warnings
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +25,7 @@ from a2tg_jax.base.checks import (
     short_repr,
 )
 from a2tg_jax.base.named_fields import NamedFields
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.core.numerics import safe_divide, safe_sqrt
 from a2tg_jax.core.pytree import pytree
 from a2tg_jax.core.sh import NUM_BASES, SH_C0
@@ -238,10 +238,9 @@ def init_from_points(
     scales = np.sqrt(np.maximum(np.mean(distances**2, axis=1), 1e-7))
     rounding = float(np.spacing(np.abs(points).max().astype(np.float32)))
     if rounding > MOST_ROUNDING * np.median(scales):
-        warnings.warn(
+        warn(
             f"points are in map coordinates, where means of float32 have steps of {rounding:g}, "
-            f"{rounding / np.median(scales):.2g} of the Gaussians' size: subtract an offset from points and cameras",
-            stacklevel=2,
+            f"{rounding / np.median(scales):.2g} of the Gaussians' size: subtract an offset from points and cameras"
         )
     count = len(points)
     # A normalised 4D normal is uniform over rotations.

@@ -7,7 +7,6 @@ prunes Gaussians that matter in too few training views, or are close to a camera
 """
 
 import dataclasses
-import warnings
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -18,6 +17,7 @@ from jax import Array
 
 from a2tg_jax.base.checks import check_fields
 from a2tg_jax.base.text import counted
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree, static
@@ -64,10 +64,9 @@ class Prune(FractionsEvent):
         num = model.num
         left = num - round(num * float(self.share)) if self.keep is None else min(num, self.keep)
         if left < LEAST_LEFT:
-            warnings.warn(
+            warn(
                 f"nothing is pruned, because {left} of {counted(num, 'Gaussian')} would be left, and training needs "
-                f"{LEAST_LEFT}: lower the share",
-                stacklevel=2,
+                f"{LEAST_LEFT}: lower the share"
             )
             left = num
         weights = shown_in(model, due).weights
@@ -182,10 +181,9 @@ class PruneFloaters(FractionsEvent):
         if self.near:
             is_kept &= ~are_near(np.asarray(model.gaussians.means)[:num], due.views, self.near)
         if is_kept.sum() < LEAST_LEFT:
-            warnings.warn(
+            warn(
                 f"no floaters are pruned, because {is_kept.sum()} of {num:,} Gaussians would be left, and training "
-                f"needs {LEAST_LEFT}: lower near or min_views",
-                stacklevel=2,
+                f"needs {LEAST_LEFT}: lower near or min_views"
             )
             is_kept[:] = True
         return keep_rows(model, moments, state, is_kept)

@@ -6,7 +6,6 @@ A pair is a splat and a tile that it may touch. Programs are compiled for a capa
 import dataclasses
 import functools
 import math
-import warnings
 from collections.abc import Iterable
 from typing import Any
 
@@ -16,6 +15,7 @@ from jax import Array
 
 from a2tg_jax.appearance import Appearance
 from a2tg_jax.base.checks import check_kind
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.rasterize.compositor import list_tiles
@@ -89,14 +89,13 @@ def has_rows(gaussians: Gaussians, num_live: Any) -> bool:
     return gaussians.num > 0 and (num_live is None or int(num_live) > 0)
 
 
-def warn_of_empty(cameras: str, stacklevel: int = 5) -> None:
+def warn_of_empty(cameras: str) -> None:
     """Warn that no Gaussian is visible from cameras, in words."""
-    warnings.warn(
+    warn(
         f"no Gaussian is visible from {cameras}: viewmat must be world to camera (np.linalg.inv of camera to world), "
         "with OpenCV axes, x right, y down, z forward (np.diag([1, -1, -1, 1]) @ viewmat of OpenGL or Blender), in the "
         "world and the unit of the Gaussians; or all are fainter than 1/255",
         EmptyRenderWarning,
-        stacklevel=stacklevel,
     )
 
 

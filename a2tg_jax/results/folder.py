@@ -27,7 +27,6 @@ import glob
 import json
 import os
 import shlex
-import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -35,6 +34,7 @@ from a2tg_jax.base.atomic import left_over, named_if_full, write_whole
 from a2tg_jax.base.operating_system import flush_folder, try_lock
 from a2tg_jax.base.regular_files import is_regular, read_regular
 from a2tg_jax.base.text import first_names
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.data.other_runs import model_hint
 
 # If the newest is damaged, training continues from the one before.
@@ -151,7 +151,7 @@ class RunFolder(StageFiles):
         self.own_all([path.relative_to(self.path).as_posix()])
         if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(self.path.resolve()):
             target = os.readlink(path)
-            warnings.warn(f"{path} was a link to {target}, which stays: runs write into their own folder", stacklevel=2)
+            warn(f"{path} was a link to {target}, which stays: runs write into their own folder")
             path.unlink()
         return path
 

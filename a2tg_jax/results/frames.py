@@ -10,7 +10,6 @@ import os
 import re
 import shutil
 import subprocess
-import warnings
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import get_args
@@ -23,6 +22,7 @@ from a2tg_jax import Camera, Model, Origin, Renderer, path_through, resize_camer
 from a2tg_jax.base.atomic import replacing, write_whole
 from a2tg_jax.base.regular_files import is_regular, read_regular
 from a2tg_jax.base.text import did_you_mean, shortened
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.data.camera_paths import front_view
 from a2tg_jax.data.capture_geometry import SURROUNDED, largest_gap, matrices_of, without_outlying
 from a2tg_jax.host.progress_bars import progress_over
@@ -221,10 +221,9 @@ def _cameras(model: Model, route: CameraPath | Path, num_frames: int) -> dict[st
     if route == "orbit":
         gap = unseen_angle(origin)
         if gap > SURROUNDED:
-            warnings.warn(
+            warn(
                 f"no camera is in {np.degrees(gap):.0f}° of this orbit, where the model shows what no photograph "
-                "shows: `path` smooth stays where photographs were taken",
-                stacklevel=3,
+                "shows: `path` smooth stays where photographs were taken"
             )
         return _numbered(turntable([cameras[index] for index in by_name], num_frames, origin.up))
     tests = {origin.names[index]: cameras[index] for index in by_name if origin.is_test[index]}

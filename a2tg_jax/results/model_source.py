@@ -22,6 +22,7 @@ from a2tg_jax import (
     transform_gaussians,
 )
 from a2tg_jax.base.regular_files import is_regular
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.data.load import is_scene
 from a2tg_jax.data.other_runs import model_hint
 from a2tg_jax.io.edit_file import apply_edit, load_edit
@@ -76,7 +77,7 @@ class Source:
         try:
             return self.load_scene()
         except (OSError, ValueError) as error:
-            warnings.warn(f"the photographs are left out: {error}", stacklevel=2)
+            warn(f"the photographs are left out: {error}")
             return None
 
 
@@ -134,7 +135,7 @@ def readable_checkpoint(run: RunFolder, planned: PlannedStage) -> tuple[Path, Ch
     except ValueError as error:
         if not older:
             raise
-        warnings.warn(f"{error}; {older[-1].name} is taken instead", stacklevel=2)
+        warn(f"{error}; {older[-1].name} is taken instead")
         return older[-1], load_checkpoint(older[-1], system=type(planned.system))
 
 
@@ -183,7 +184,7 @@ def _source_of_run(run: RunFolder, name: str | None) -> Source:
     is_finished = is_regular(run.model(planned.name))
     if note:
         advice = "; `model` NAME takes another one's newest checkpoint" if is_finished else ""
-        warnings.warn(f"{note}{advice}", stacklevel=3)
+        warn(f"{note}{advice}")
     return Source(
         model=model,
         title=record.scene.name,
@@ -203,7 +204,7 @@ def _source_of_file(path: Path) -> Source:
         model = load_splats(path)
     notes = [str(warning.message).removeprefix(f"{path}: ") for warning in caught]
     for note in notes:
-        warnings.warn(f"{path}: {note}", stacklevel=3)
+        warn(f"{path}: {note}")
     return Source(model, path.stem, ". ".join(notes), path=path)
 
 
@@ -243,7 +244,7 @@ def check_init(file: Path, out: Path, system: System) -> Model:
     # The first stage begins with its own appearance.
     lost = left_out(splats, system.initial_sh_degree, system.stages()[0].appearance)
     if lost:
-        warnings.warn(f"`init` {file} leaves out {' and '.join(lost)}", stacklevel=2)
+        warn(f"`init` {file} leaves out {' and '.join(lost)}")
     return splats
 
 

@@ -2,11 +2,11 @@
 
 import os
 import tempfile
-import warnings
 from collections.abc import Iterable
 from pathlib import Path
 
 from a2tg_jax.base.atomic import file_to_write
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.results.folder import RunFolder
 
 EXPORTS = (".a2tgz", ".glb")
@@ -33,7 +33,7 @@ def check_output(path: Path) -> None:
     except OSError as error:
         raise ValueError(f"{path} cannot be made, because {existing} is not writable: {error.strerror}") from None
     if len(missing) > 1 and not existing.is_relative_to(os.getcwd()):
-        warnings.warn(f"{missing[-1]} does not exist and will be made", stacklevel=2)
+        warn(f"{missing[-1]} does not exist and will be made")
 
 
 def check_apart(out: Path, other: Path) -> None:

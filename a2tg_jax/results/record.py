@@ -22,7 +22,6 @@ In a file with `version`, as a run's has, missing options are as in the preset "
 
 import dataclasses
 import os
-import warnings
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
@@ -36,6 +35,7 @@ from a2tg_jax.base.config_json import changed_config, config_from_dict, config_t
 from a2tg_jax.base.json_text import read_toml
 from a2tg_jax.base.regular_files import expanded, is_regular
 from a2tg_jax.base.text import MEGABYTE, budget_in_bytes, did_you_mean, megabytes_of, shortened
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.data.load import SceneSource
 from a2tg_jax.io.model_rows import check_encodable
 from a2tg_jax.results.commands import repeating_command
@@ -161,7 +161,7 @@ class RunRecord:
         built-in scene. Raises as `scene_place`."""
         path = self.scene.path
         if self.scene.is_built_in and (folder / path).exists():
-            warnings.warn(f"{path} is the built-in scene; give ./{path} for the folder of that name", stacklevel=2)
+            warn(f"{path} is the built-in scene; give ./{path} for the folder of that name")
         if path and not self.scene.is_built_in:
             path = scene_place(path, folder)
         init = None if self.init is None else scene_place(self.init, folder)

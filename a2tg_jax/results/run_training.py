@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import functools
-import warnings
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -20,6 +19,7 @@ from a2tg_jax import (
     save_model,
 )
 from a2tg_jax.base.machine import Devices
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.finish.tuning import ITERATIONS
 from a2tg_jax.host import signals
 from a2tg_jax.host.errors import error_text
@@ -61,7 +61,7 @@ def unseen(scene: Scene) -> AbstractContextManager[Callable[..., float]]:
 def warn_of_doubts(doubts: Sequence[str]) -> None:
     """Warn of each doubt."""
     for doubt in doubts:
-        warnings.warn(doubt, stacklevel=3)
+        warn(doubt)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -200,7 +200,7 @@ def _write_file(run: RunFolder, record: RunRecord, max_bytes: int, scene: Scene,
         options.on_note(line)
     except ValueError as error:
         another = file_command(run, "SIZE")
-        warnings.warn(f"no file was written: {error}; to try another size: {another}", stacklevel=2)
+        warn(f"no file was written: {error}; to try another size: {another}")
 
 
 # Training of the stages
@@ -306,5 +306,5 @@ def _restored(run: RunFolder, name: str, error: DivergedError, on_nan: OnNan) ->
     checkpoints = run.checkpoints(name)
     back = f"iteration {iteration_of(checkpoints[-1])}" if checkpoints else "its beginning"
     times = f"({num_restored} of {MOST_RESTORED} times)"
-    warnings.warn(f"{text}; the stage restarts from {back} with the views in another order {times}", stacklevel=4)
+    warn(f"{text}; the stage restarts from {back} with the views in another order {times}")
     return num_restored

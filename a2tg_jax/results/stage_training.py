@@ -1,7 +1,6 @@
 """Training of one stage in a folder, from its newest checkpoint, with checks of what it resumes and starts from."""
 
 import dataclasses
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,6 +9,7 @@ from a2tg_jax.base.archive import read_archive_header
 from a2tg_jax.base.config_json import flatten_config
 from a2tg_jax.base.machine import this_machine
 from a2tg_jax.base.text import counted
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.model_file import FORMAT
 from a2tg_jax.results.folder import DAMAGED, StageFiles
 from a2tg_jax.results.plan import PlannedStage, is_same_so_far
@@ -128,9 +128,7 @@ def newest_checkpoint(files: StageFiles, planned: PlannedStage) -> Checkpoint | 
         _check_made_alike(path, checkpoint, planned)
         for damaged_path, reason in damaged:
             aside = damaged_path.replace(files.own(damaged_path.with_name(damaged_path.name + DAMAGED)))
-            warnings.warn(
-                f"{reason}; it was renamed to {aside.name}, and training continues from {path.name}", stacklevel=2
-            )
+            warn(f"{reason}; it was renamed to {aside.name}, and training continues from {path.name}")
         return checkpoint
     if damaged:
         raise ValueError(
@@ -144,10 +142,9 @@ def last_state(files: StageFiles, before: PlannedStage, name: str) -> Checkpoint
     kept. Raises ValueError if it cannot be read, or was made with other options."""
     path = files.state(before.name)
     if not path.is_file():
-        warnings.warn(
+        warn(
             f"{name} continues {before.name} without Adam's moments, so that the first iterations may make pictures "
-            f"worse: there is no {path}",
-            stacklevel=3,
+            f"worse: there is no {path}"
         )
         return None
     try:
@@ -173,10 +170,7 @@ def _check_made_alike(path: Path, checkpoint: Checkpoint, planned: PlannedStage)
     _check_options(path, checkpoint.system, planned)
     differences = [] if checkpoint.machine is None else checkpoint.machine.differences(this_machine())
     if differences:
-        warnings.warn(
-            f"{path.name} was made on another machine, so last bits will differ: {'; '.join(differences)}",
-            stacklevel=3,
-        )
+        warn(f"{path.name} was made on another machine, so last bits will differ: {'; '.join(differences)}")
 
 
 def _check_options(path: Path, made: System, planned: PlannedStage) -> None:

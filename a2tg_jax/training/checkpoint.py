@@ -2,7 +2,6 @@
 
 import dataclasses
 import os
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -19,6 +18,7 @@ from a2tg_jax.base.machine import ALONE, Devices, Machine, this_machine
 from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.regular_files import expanded, reading
 from a2tg_jax.base.text import counted, shortened
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import combine, partition
@@ -299,10 +299,9 @@ def state_of_checkpoint(
         resume.views.check(views)
     num = resume.state.model.num_rows
     if num % num_devices:
-        warnings.warn(
+        warn(
             f"the checkpoint has {num:,} rows, which {num_devices} devices cannot share evenly: each holds all of them "
-            "until the stage ends",
-            stacklevel=2,
+            "until the stage ends"
         )
     state = copied(resume.state)
     if resume.stage != index:

@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import os
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 from a2tg_jax.base.checks import check_int, check_kind, check_untraced, kind_of
 from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.text import counted, in_bytes, shortened
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.core.budget import LARGEST_SHORTFALL
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.model import Model
@@ -365,4 +365,4 @@ def warn_of_budget(system: System, model: Model) -> None:
     else:
         advice = f"raise {system.more_growth()}"
     share = f"{used / budget:.1%} of the memory_budget of {budget:,}"
-    warnings.warn(f"the model takes {used:,} bytes, {share}: {advice}", stacklevel=4)
+    warn(f"the model takes {used:,} bytes, {share}: {advice}")

@@ -1,13 +1,13 @@
 """Training views as checkpoints record them, so that training is resumed with the same ones."""
 
 import dataclasses
-import warnings
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from a2tg_jax.base.checks import check_shape
 from a2tg_jax.base.text import first_names, shortened
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.scene import View
 
 UNKNOWN = -1
@@ -79,10 +79,9 @@ class RecordedViews:
         is_known = (self.pixels != UNKNOWN) & (present.pixels != UNKNOWN)
         changed = (is_known & (self.pixels != present.pixels)) | (self.masks != present.masks)
         if changed.any():
-            warnings.warn(
+            warn(
                 f"photographs or masks have changed since the checkpoint was made: {self._named(changed)}; what was "
-                "learned from the former ones stays in the model",
-                stacklevel=4,
+                "learned from the former ones stays in the model"
             )
 
     def _named(self, chosen: np.ndarray) -> str:

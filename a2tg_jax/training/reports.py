@@ -7,7 +7,6 @@ import collections
 import dataclasses
 import datetime
 import time
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple, Self
 
@@ -17,6 +16,7 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.base.text import counted
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.events import Change, HostEvent, Times
 from a2tg_jax.scene import View, view_image
 from a2tg_jax.training.batches import BatchOrder, can_halve
@@ -210,10 +210,9 @@ class LearningCheck:
                 mask = None if view.mask is None else view.mask.read()
                 flat.append(float(jax.jit(flat_psnr)(view_image(view, (self._level,) * 3), mask)))
         if not has_learned(reached, float(np.mean(flat))):
-            warnings.warn(
+            warn(
                 f"training does not learn: {reached:.1f} dB on the training views after {self._at:,} iterations, where "
-                f"one flat colour per view reaches {np.mean(flat):.1f} dB. {self._advice}",
-                stacklevel=2,
+                f"one flat colour per view reaches {np.mean(flat):.1f} dB. {self._advice}"
             )
 
 
@@ -302,12 +301,11 @@ class StageEffects:
             effects.num_compiled += 1
             if effects.num_compiled == MANY_PROGRAMS and type(event).with_room is HostEvent.with_room:
                 left = len(self._ahead(times, iteration))
-                warnings.warn(
+                warn(
                     f"stage {self._stage.name!r}: {type(event).__name__} has changed shapes {MANY_PROGRAMS} times, and "
                     f"each time a step was compiled, last for {seconds:.0f} s; it happens {counted(left, 'time')} "
                     "more: keep shapes, by keep_rows(model, moments, state, is_kept) to remove Gaussians, or by "
-                    "padding in with_room for what will be added",
-                    stacklevel=2,
+                    "padding in with_room for what will be added"
                 )
 
     def programs_ahead(self, iteration: int) -> int:
@@ -339,10 +337,9 @@ class StageEffects:
                 continue
             first = next((time for time in times if time >= 1), times[-1])
             if not 1 <= first <= end:
-                warnings.warn(
+                warn(
                     f"stage {self._stage.name!r}: {self._system.path_of(event)} never happens: it is first due at "
-                    f"iteration {first:,} of {end:,}",
-                    stacklevel=2,
+                    f"iteration {first:,} of {end:,}"
                 )
 
     def warn_at_end(self, num_refused: int, num_rows: int) -> None:
@@ -359,13 +356,12 @@ class StageEffects:
             elif effects.unused:
                 unused.append(f"{name}.{effects.unused}")
         if unused:
-            warnings.warn(f"stage {self._stage.name!r}: {'; '.join(unused)}", stacklevel=2)
+            warn(f"stage {self._stage.name!r}: {'; '.join(unused)}")
         if num_refused:
             events = [event for event in self._stage.events if event.limited_by]
             caps = [f"{self._system.path_of(event)}.{event.limited_by}" for event in events]
             advice = f": raise {' or '.join(caps)}" if caps else ""
-            warnings.warn(
+            warn(
                 f"stage {self._stage.name}: {num_refused:,} times there was no room for a Gaussian that should have "
-                f"been added, all {num_rows:,} rows being in use{advice}",
-                stacklevel=2,
+                f"been added, all {num_rows:,} rows being in use{advice}"
             )

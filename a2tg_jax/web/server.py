@@ -11,11 +11,11 @@ import secrets
 import socket
 import threading
 import time
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future
 from typing import Any
 
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.host import signals
 from a2tg_jax.host.optional import optional
 
@@ -176,7 +176,7 @@ def served(routes: Mapping[str, Route], *, host: str = LOOPBACK, port: int = 0) 
     with _running(routes, host, port) as (url, ended):
         yield url
     if error := ended.exception():
-        warnings.warn(f"the viewer's server ended early: {error}", stacklevel=3)
+        warn(f"the viewer's server ended early: {error}")
 
 
 def close_stalled(channels: Iterable[Any], now: float) -> None:

@@ -7,7 +7,6 @@ another one. `jax.lax.platform_dependent` traces the code of all platforms, `by_
 import functools
 import importlib.util
 import os
-import warnings
 from collections.abc import Callable, Hashable
 from typing import Any, NoReturn, TypeVar
 
@@ -20,6 +19,7 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
+from a2tg_jax.base.user_warnings import warn
 from a2tg_jax.rasterize.kernels.cuda import nvrtc
 from a2tg_jax.rasterize.splats import Compositor, CompositorChoice
 
@@ -82,7 +82,7 @@ def instead_of(compositor: CompositorChoice, appearance: type, reason: str) -> N
 
 @functools.cache
 def _warn_of_fallback(appearance: type, reason: str) -> None:
-    warnings.warn(f"{appearance.__name__} is composited by XLA, which is slower: {reason}", stacklevel=2)
+    warn(f"{appearance.__name__} is composited by XLA, which is slower: {reason}")
 
 
 @functools.cache
@@ -97,7 +97,7 @@ def has_native() -> bool:
 
     reason = ffi.refusal()
     if reason is not None:
-        warnings.warn(f"compositing by XLA, which is slower: {reason}; install a jax that was tried", stacklevel=2)
+        warn(f"compositing by XLA, which is slower: {reason}; install a jax that was tried")
     return reason is None
 
 
@@ -108,7 +108,7 @@ def has_cuda() -> bool:
 
     reason = check.failure() if nvrtc.find() else f"CUDA kernels need {REMEDIES['cuda']}"
     if reason is not None:
-        warnings.warn(f"compositing by XLA, which is slower: {reason}", stacklevel=2)
+        warn(f"compositing by XLA, which is slower: {reason}")
     return reason is None
 
 
