@@ -78,9 +78,10 @@ class HostEvents:
 def _moved(event: Event, gathered: Any, rows: np.ndarray, model: Model) -> Any:
     """Return the state of an event after rows have moved, given the model with moved rows."""
     moved = event.gather(gathered, rows)
+    if type(event).gather is not Event.gather:
+        return moved
     new = event.init(model)
-    is_alike: bool = jax.tree.structure(new) == jax.tree.structure(moved)  # type: ignore[operator]
-    if type(event).gather is not Event.gather or not is_alike:
+    if jax.tree.structure(new) != jax.tree.structure(moved):  # type: ignore[operator]
         return moved
     # Gaussians that are added between steps take the rows of removed ones.
     is_removed = jnp.arange(model.num_rows) >= model.live_count

@@ -298,7 +298,7 @@ def choices_table(results: Sequence[Result], default: str) -> str:
         by_column = {column: [result for result in own if place(result) == column] for column in columns}
         if label == default:
             shown = [quality(found) for found in by_column.values()]
-            rows.append([f"*{default}, as it is*", *shown, number(mean(own, "psnr"), 2), number(mean(own, "mb"), 2)])
+            rows.append([f"*{default}, unchanged*", *shown, number(mean(own, "psnr"), 2), number(mean(own, "mb"), 2)])
             continue
         gains = [_mean_gain(found, base) for found in by_column.values()]
         average = MISSING if None in gains else _gain_text(np.mean(gains, axis=0))
