@@ -232,7 +232,7 @@ def next_sizes(
     Args:
       sizes: [N, 2] integers (Tv, Tu).
       scales: [N, 2] standard deviations (s_x, s_y), in units of the normalised world.
-      k_a: aspect ratio above which a Gaussian is elongated.
+      k_a: aspect ratio above which a Gaussian is elongated, at least 1.
       k_s: shorter scale below which an elongated Gaussian is thin.
       cap: largest side.
       anisotropic: False doubles both axes always.
@@ -254,7 +254,7 @@ def next_sizes(
     scales = np.asarray(scales)
     if (scales < 0).any():
         raise ValueError(f"scales must be positive standard deviations; got {scales.min():g}: use gaussians.scales")
-    check_number("k_a", k_a, least=0)
+    check_number("k_a", k_a, least=1)
     check_number("k_s", k_s, least=0)
     check_int("cap", cap, 1, MAX_SIDE)
     check_literal("axes", axes, Axes)

@@ -376,6 +376,9 @@ class Mcmc(StepEvent):
 class FillingMcmc(Mcmc):
     """Variant of `Mcmc` that grows by more than 5 % where that is needed to reach the cap by its last event."""
 
+    cap: int = static(default=500_000)
+    """Largest number of Gaussians, at least 2. A memory_budget replaces it."""
+
     def check_options(self) -> None:
         check_fields(self, "cap", least=2)
 

@@ -192,15 +192,19 @@ class Model(NamedFields):
         coefficients = self.appearance.coefficients
         if coefficients is None:
             return common
-        highest = int(self.degrees.max(initial=self.gaussians.sh_degree))
         dense = dense_bands(coefficients, self.gaussians.sh_degree)
-        return np.concatenate([common, dense], axis=1, dtype=common.dtype)[:, : NUM_BASES[highest]]
+        return np.concatenate([common, dense], axis=1, dtype=common.dtype)[:, : self._num_coefficients]
+
+    @property
+    def _num_coefficients(self) -> int:
+        """Number K of spherical harmonics of the highest degree (host)."""
+        return NUM_BASES[int(self.degrees.max(initial=self.gaussians.sh_degree))]
 
     def with_sh(self, sh: np.ndarray) -> "Model":
         """Return the same model with other spherical harmonics, as `sh` gives them; degrees stay (host). ValueError:
         they have another shape."""
         base = self.gaussians.sh_degree
-        check_shape("sh", sh, (self.num_rows, "K", 3))
+        check_shape("sh", sh, (self.num_rows, self._num_coefficients, 3))
         common = jnp.asarray(sh[:, : NUM_BASES[base]], self.gaussians.sh.dtype)
         model = dataclasses.replace(self, gaussians=dataclasses.replace(self.gaussians, sh=common))
         if self.appearance.coefficients is None:

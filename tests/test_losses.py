@@ -157,6 +157,19 @@ def test_normal_consistency_gradient(x64):
     check_grads(loss, (rendered, bumpy * alpha, alpha), 1, modes=["rev"], eps=1e-6)
 
 
+def test_a_gpu_does_not_round_the_points_of_a_depth_map():
+    """By default, factors of float32 have 10 bits there, in which neighbouring rays differ by a few steps only."""
+    camera, depth, normal = plane_view()
+
+    def loss(depth, camera):
+        return normal_consistency(jnp.broadcast_to(normal, (*depth.shape, 3)), depth, jnp.ones_like(depth), camera)
+
+    text = jax.jit(jax.grad(loss, (0, 1))).lower(depth, camera).as_text()
+    products = [line for line in text.splitlines() if "dot_general" in line and f"tensor<{depth.shape[0]}x" in line]
+    assert len(products) >= 2
+    assert all("precision = [HIGHEST, HIGHEST]" in product for product in products)
+
+
 def test_regularisers_see_live_rows_only():
     rng = np.random.default_rng(0)
     gaussians = init_from_points(rng.normal(size=(8, 3)), rng.uniform(size=(8, 3)))

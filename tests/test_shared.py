@@ -212,6 +212,57 @@ def test_files_keep_what_is_shared(kind, tmp_path):
         a2tg.save_compact(tmp_path / "model.a2tgz", model)
 
 
+@a2tg.pytree
+class Layer:
+    weights: jax.Array
+
+
+@a2tg.pytree(kw_only=True)
+class Layered(a2tg.Appearance):
+    """A field and an array in it whose paths have the word by which files of version 0.2 named arrays."""
+
+    inner: Layer | None = a2tg.shared()
+    spinner: Layer | None = None
+
+    def allocate(self, key, gaussians):
+        rows = Layer(jnp.arange(2.0 * gaussians.num).reshape(-1, 2))
+        return dataclasses.replace(self, inner=Layer(jnp.arange(3.0)), spinner=rows)
+
+
+def test_files_keep_fields_of_any_name(tmp_path):
+    gaussians = some_model().gaussians
+    model = a2tg.Model(gaussians, a2tg.allocate_appearance(Layered(), jax.random.key(0), gaussians))
+    a2tg.save_model(tmp_path / "model.npz", model)
+    assert_same(a2tg.load_model(tmp_path / "model.npz", appearances=(Layered,)), model)
+
+
+@a2tg.pytree(kw_only=True)
+class Shapely(a2tg.Appearance):
+    """A field that would be taken for the shapes of kernels."""
+
+    shapes: jax.Array | None = None
+
+    def allocate(self, key, gaussians):
+        return dataclasses.replace(self, shapes=jnp.ones(gaussians.num))
+
+
+@pytest.mark.parametrize(
+    ("template", "message"),
+    [
+        (Codebook(texture=a2tg.Texture()), r"Codebook\.texels must have another name: files have texels of"),
+        (Shapely(), r"Shapely\.shapes must have another name: it replaces Appearance\.shapes"),
+    ],
+)
+def test_names_of_fields_that_are_taken(template, message, tmp_path):
+    """Numbers would replace the textures in files, or act as the shapes of kernels."""
+    gaussians = some_model().gaussians
+    model = a2tg.Model(gaussians, a2tg.allocate_appearance(template, jax.random.key(0), gaussians))
+    stage = dataclasses.replace(Own().stages()[0], appearance=template)
+    for use in (stage.check, lambda: a2tg.save_model(tmp_path / "model.npz", model)):
+        with pytest.raises(ValueError, match=message):
+            use()
+
+
 def test_a_file_with_other_shared_numbers_is_refused(tmp_path):
     model = some_model()
     network = {**model.appearance.network, "weights": jnp.zeros((9, 7))}

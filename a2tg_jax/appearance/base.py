@@ -444,8 +444,14 @@ def check_appearance(appearance: Appearance, gaussians: Gaussians) -> None:
     for path, leaf in jax.tree_util.tree_leaves_with_path(partition(appearance)[0]):
         if str(leaf.dtype) not in FLOATS:
             raise ValueError(f"{kind}{jax.tree_util.keystr(path)} must be floats, {dtypes}; got {leaf.dtype}")
-    for part in _parts_of(appearance).values():
+    added = added_fields(appearance)
+    for name in added:
+        if hasattr(Appearance, name):
+            raise ValueError(f"{kind}.{name} must have another name: it replaces Appearance.{name}")
+    for part_name, part in _parts_of(appearance).items():
         part.check(gaussians)
+        for name in set(added).intersection(part.names_in_files):
+            raise ValueError(f"{kind}.{name} must have another name: files have {name} of the part {part_name}")
     for path, leaf in jax.tree_util.tree_leaves_with_path(appearance, is_leaf=is_whole):
         name = kind + jax.tree_util.keystr(path)
         if path[0].name in PARTS:

@@ -65,7 +65,8 @@ def arrays_of(appearance: Appearance, sh_degree: int) -> dict[str, np.ndarray]:
 def with_arrays(template: Appearance, arrays: Mapping[str, np.ndarray], sh_degree: int) -> Appearance:
     """Return an appearance of the options of a template, with the arrays of a file, as `arrays_of` returns them or
     version 0.2 wrote them (host). ValueError: an array is missing, or its shape does not fit the others."""
-    arrays = {name.replace(OLD_INNER, ""): array for name, array in arrays.items()}
+    # A field may have such a name itself.
+    arrays = {name.replace(OLD_INNER, ""): array for name, array in arrays.items()} | {**arrays}
     changes: dict[str, Any] = {}
     if template.bands is not None:
         changes["bands"] = Bands(_coefficients(arrays, sh_degree))

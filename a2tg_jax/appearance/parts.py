@@ -30,6 +30,9 @@ from a2tg_jax.texture import NEUTRAL_TEXEL, Textures, allocate_textures, check_t
 class Part(NamedFields):
     """Part of an appearance: static options, and arrays with a row for each Gaussian, None until they are allocated."""
 
+    names_in_files: ClassVar[tuple[str, ...]]
+    """Names of its arrays in files (`appearance.files`)."""
+
     def allocate(self, gaussians: Gaussians) -> Self:
         """Return the part with initial arrays for N Gaussians (host)."""
         raise NotImplementedError
@@ -123,6 +126,8 @@ class Texture(Part):
     """Initial (Tv, Tu) of every texture, each 1 to 16; (0, 0): no textures until they grow."""
     options: TextureOptions = static(default=TextureOptions())
     """Conventions of the textures."""
+
+    names_in_files = ("sizes", "texels")
 
     def allocate(self, gaussians: Gaussians) -> "Texture":
         sizes = np.broadcast_to(np.asarray(self.start, np.int64), (gaussians.num, 2))
@@ -260,6 +265,8 @@ class Exponents(Part):
     shapes: Array | None = None
     """[N] shapes s of the exponents exp(tanh s); 0 is a Gaussian. None until allocated."""
 
+    names_in_files = ("shapes",)
+
     @staticmethod
     def of_logarithms(logarithms: Array) -> "Exponents":
         """Return the part with exponents of given logarithms, cut to ±1; traceable."""
@@ -376,6 +383,8 @@ class Bands(Part):
 
     coefficients: Coefficients | None = None
     """Coefficients of N Gaussians; None until allocated."""
+
+    names_in_files = ("degrees", "base_degree", "band_1", "band_2", "band_3")
 
     def allocate(self, gaussians: Gaussians) -> "Bands":
         degrees = np.full(gaussians.num, gaussians.sh_degree)

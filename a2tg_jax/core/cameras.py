@@ -235,10 +235,13 @@ def back_project(depth: Array, camera: Camera) -> Array:
     x, y = jnp.meshgrid(jnp.arange(width, dtype=depth.dtype) + 0.5, jnp.arange(height, dtype=depth.dtype) + 0.5)
     if camera.rays is not None:
         x, y = jnp.moveaxis(jnp.where(jnp.isfinite(camera.rays), camera.rays, 0.0), -1, 0)
-    rays = jnp.stack([x, y, jnp.ones_like(x)], -1) @ jnp.linalg.inv(camera.K).T
+    to_rays = jnp.linalg.inv(camera.K).T
     rotation = camera.viewmat[:3, :3]
-    # Rays are rows: r·Rc is Rcᵀ·r, transposed.
-    return (rays @ rotation) * depth[..., None] + camera.center[None, None]
+    # By default GPUs may round the factors of large products to 10 bits (TF32), by a tenth of the step between pixels.
+    with jax.default_matmul_precision("highest"):
+        rays = jnp.stack([x, y, jnp.ones_like(x)], -1) @ to_rays
+        # Rays are rows: r·Rc is Rcᵀ·r, transposed.
+        return (rays @ rotation) * depth[..., None] + camera.center[None, None]
 
 
 def pinhole_pixels(points: np.ndarray, K: np.ndarray) -> np.ndarray:

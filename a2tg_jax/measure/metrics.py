@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.base.checks import check_kind, check_shape, plain_array
+from a2tg_jax.base.checks import check_kind, check_mask, plain_array
 from a2tg_jax.base.named_fields import NamedFields
 from a2tg_jax.base.npz import read_npz
 from a2tg_jax.base.regular_files import expanded, is_regular
@@ -42,7 +42,7 @@ def psnr(image: Array, target: Array, mask: Array | None = None) -> Array:
       A scalar in dB; higher is better.
 
     Raises:
-      ValueError: if the shapes differ, or an image is in 0..255.
+      ValueError: if the shapes differ, an image is in 0..255, or the mask is not boolean.
 
     Examples:
       >>> image, target = jnp.zeros((16, 16, 3)), jnp.full((16, 16, 3), 0.1)
@@ -67,7 +67,8 @@ def ssim(image: Array, target: Array, mask: Array | None = None) -> Array:
       A scalar in [-1, 1]; 1 for equal images.
 
     Raises:
-      ValueError: if the shapes differ, an image is in 0..255 or a side is shorter than 11 pixels.
+      ValueError: if the shapes differ, an image is in 0..255, the mask is not boolean, or a side is shorter than 11
+        pixels.
 
     Examples:
       >>> photograph = jnp.asarray(a2tg.view_image(scene.test[0]))
@@ -127,7 +128,8 @@ def lpips(
       A scalar, 0 for equal images; lower is better.
 
     Raises:
-      ValueError: if the shapes differ, an image is in 0..255 or a side is too short, or as `load_lpips` does.
+      ValueError: if the shapes differ, an image is in 0..255, the mask is not boolean, or a side is too short, or as
+        `load_lpips` does.
 
     Examples:
       >>> photograph = jnp.asarray(a2tg.view_image(scene.test[0]))
@@ -184,7 +186,7 @@ def _clip_pair(image: Array, target: Array, mask: Array | None = None) -> tuple[
     if mask is None:
         return image, target
     mask = plain_array("mask", mask)
-    check_shape("mask", mask, image.shape[:2])
+    check_mask("mask", mask, image.shape[:2])
     counts = jnp.asarray(mask)[..., None]
     return jnp.where(counts, image, 0.0), jnp.where(counts, target, 0.0)
 

@@ -244,7 +244,7 @@ def depth_loss(depth: Array, alpha: Array, prior: Array, counts: Array, *, has_s
 def scale_and_shift(prior: Array, inverse: Array, counts: Array, *, has_shift: bool = True) -> tuple[Array, Array]:
     """Return s ≥ 0 and t that minimise Σ (s·prior + t − inverse)² over the pixels that count.
 
-    Where all values of the prior are equal, s is 0.
+    Without a shift, t is 0; with one, s is 0 where all values of the prior are equal.
     """
     weights = counts.astype(prior.dtype)
     num = jnp.maximum(jnp.sum(weights), 1)
