@@ -539,6 +539,14 @@ def test_without_a_terminal_tenths_are_plain_lines(capsys, monkeypatch):
     assert lines[:2] == ["a-stage: compiling", "a-stage: 2 of 20, loss 0.5000, 20.00 dB"] and len(lines) == 11
 
 
+def test_an_infinite_psnr_does_not_stay_in_the_running_mean(capsys, monkeypatch):
+    monkeypatch.setattr(progress_bars, "PLAIN_SECONDS", 0.0)
+    with a2tg.ProgressBar("a-stage", 0, 4) as bar:
+        for done, psnr in enumerate((np.inf, 20.0, np.inf, 20.0), 1):
+            bar.update(done, 0.5, psnr, None, None)
+    assert capsys.readouterr().err.endswith("a-stage: 4 of 4, loss 0.5000, 20.00 dB\n")
+
+
 def test_in_a_notebook_a_bar_is_one_output(capsys, monkeypatch):
     """Each output of a cell that is shown, with all lines that replaced one another."""
     outputs = []

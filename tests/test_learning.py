@@ -76,6 +76,21 @@ def test_long_first_stages_are_checked_once_after_a_fifth(scene):
     assert checks_of(tuple(dataclasses.replace(view, picture=one_colour) for view in scene.train), 20.0)[0] == []
 
 
+def test_empty_photographs_count_in_no_mean(scene):
+    """A photograph that shows nothing of a cut-out subject, and a render that shows nothing either."""
+    away = a2tg.look_at([0, -3, 0], [0, -9, 0], width=24, height=18)
+    empty = a2tg.View("empty", away, np.zeros((18, 24, 4), np.uint8))
+    gaussians = a2tg.init_from_points(scene.points, scene.colors)
+    for background in (0.0, 0.3, 1.0):
+        options = {"background": (background,) * 3}
+        others = a2tg.evaluate(scene.train, gaussians, **options)
+        found = a2tg.evaluate([*scene.train, empty], gaussians, **options)
+        assert found.per_view[-1].psnr > 100 and len(found.per_view) == len(scene.train) + 1
+        for name in ("psnr", "ssim", "flat_psnr"):
+            assert getattr(found, name) == getattr(others, name)
+    assert a2tg.evaluate([empty], gaussians).ssim == 1
+
+
 @pytest.mark.long
 def test_evaluation_says_that_nothing_was_learned(scene):
     black, system = frozen(scene, stage1_iterations=1)

@@ -1,6 +1,7 @@
 """Progress of a training: a bar on a terminal or in a notebook, elsewhere plain lines."""
 
 import datetime
+import math
 import sys
 import time
 from collections.abc import Mapping
@@ -51,10 +52,10 @@ class ProgressBar(Display):
         """Show the iterations that are done; loss and PSNR are shown as running means."""
         if self._loss is None:
             self._loss = loss
-            self._psnr = psnr
             self._bar.set_description_str(self._title)
         self._loss += (1 - MOMENTUM) * (loss - self._loss)
-        self._psnr += (1 - MOMENTUM) * (psnr - self._psnr)
+        if math.isfinite(psnr):  # An infinite one, of an empty photograph, would stay in the mean.
+            self._psnr += (1 - MOMENTUM if self._psnr else 1) * (psnr - self._psnr)
         self._bar.update(done - self._done)
         self._done = done
         if row and not self._bar.disable:

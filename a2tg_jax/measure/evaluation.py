@@ -28,6 +28,8 @@ from a2tg_jax.training.reports import flat_psnr, has_learned
 
 NUM_TIMED = 8
 """Views that are timed."""
+ONE_COLOR = 100.0
+"""PSNR of one flat colour in dB from which a photograph is of one colour; rounding leaves 130 or more."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +50,11 @@ class ViewMetrics(NamedFields):
 
 @dataclasses.dataclass(frozen=True)
 class Evaluation(NamedFields):
-    """Quality of all views, and rendering speed."""
+    """Quality of all views, and rendering speed.
+
+    Photographs of one colour, such as empty ones, count in no mean unless all are: PSNR is infinite where a render is
+    empty as well.
+    """
 
     per_view: tuple[ViewMetrics, ...]
     """Quality of each view."""
@@ -64,7 +70,8 @@ class Evaluation(NamedFields):
         return dataclasses.replace(self, per_view=self.per_view[views], renders=self.renders[views])
 
     def _mean(self, figure: str) -> float:
-        return float(np.mean([getattr(view, figure) for view in self.per_view]))
+        views = [view for view in self.per_view if view.flat_psnr < ONE_COLOR] or self.per_view
+        return float(np.mean([getattr(view, figure) for view in views]))
 
     @property
     def psnr(self) -> float:
