@@ -24,6 +24,7 @@ from a2tg_jax.mesh.fusion import NOTHING, BlockGrid, RenderedDepth, Space, fill,
 from a2tg_jax.mesh.texturing import draw_view
 from a2tg_jax.mesh.triangles import largest_clusters
 from a2tg_jax.results import meshing
+from a2tg_jax.results.model_source import Source
 from a2tg_jax.results.options import MeshOptions
 
 SIDE = 48
@@ -480,6 +481,19 @@ def test_a_texture_is_filled_beyond_its_charts_and_keeps_colors_of_unseen_texels
     assert (unseen.texture == 9).all()
 
 
+def test_pictures_of_a_texture_are_floats_of_their_cameras(sphere):
+    """Bytes would be white, and a smaller picture would be at another place."""
+    pytest.importorskip("xatlas", reason="textures need xatlas: pip install 'a2tg-jax[mesh]'")
+    simple = a2tg.simplify_mesh(sphere, 100)
+    camera, picture, _ = painted(camera_at(np.array([0.0, -1.2, 0.0])))
+    for given, message in (
+        (np.uint8(255 * picture), "picture must be floats; got uint8"),
+        (picture[::2], "picture must be"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            a2tg.texture_mesh(simple, [(camera, given, None)], size=64)
+
+
 @pytest.mark.parametrize("suffix", [".glb", ".obj"])
 def test_textures_are_read_back_by_another_library(textured, tmp_path, suffix):
     trimesh = pytest.importorskip("trimesh", reason="trimesh reads the files back: pip install trimesh")
@@ -493,6 +507,25 @@ def test_textures_are_read_back_by_another_library(textured, tmp_path, suffix):
         2 if suffix == ".glb" else 0.01
     )
     assert [path.suffix for path in files] == ([".glb"] if suffix == ".glb" else [".obj", ".mtl", ".png"])
+
+
+def test_photographs_count_in_a_texture_where_they_are_opaque():
+    """A cut-out photograph has the model's background around the subject, which is no part of the surface."""
+    scene = a2tg.synthetic_scene(num_views=3, width=24, height=16, num_points=20, test_every=0)
+    left = np.arange(24) < np.full((16, 1), 12)
+    top = np.arange(16)[:, None] < np.full(24, 8)
+    alpha = np.where(left, 255, 254).astype(np.uint8)
+    cut_out = [np.dstack([view.image, alpha]) for view in scene.train]
+    views = [
+        dataclasses.replace(scene.train[0], picture=cut_out[0]),
+        dataclasses.replace(scene.train[1], picture=cut_out[1], mask=top),
+        dataclasses.replace(scene.train[2], mask=top),
+    ]
+    model = a2tg.Model(a2tg.init_from_points(scene.points, scene.colors), origin=scene.origin)
+    source = Source(model, "cut out", load_scene=lambda: dataclasses.replace(scene, train=tuple(views)))
+    masks = [mask for _, _, mask in meshing._photographs(source, scene.origin)]
+    for mask, wanted in zip(masks, (left, left & top, top), strict=True):
+        np.testing.assert_array_equal(mask, wanted)
 
 
 def test_missing_libraries_are_reported(sphere, model, monkeypatch):

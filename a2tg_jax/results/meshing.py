@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from a2tg_jax import Origin, Renderer, view_image
+from a2tg_jax import Origin, Renderer, View, view_image
 from a2tg_jax.base.memory import memory_limit
 from a2tg_jax.base.text import budget_in_bytes, counted, in_bytes
 from a2tg_jax.host.progress_bars import progress_over
@@ -117,9 +117,17 @@ def _photographs(source: Source, origin: Origin) -> Iterator[Picture]:
     views = [view for view in scene.train if view.name in cameras]
     background = source.model.background
     return (
-        (cameras[view.name], view_image(view, background), None if view.mask is None else view.mask.read())
+        (cameras[view.name], view_image(view, background), _opaque(view))
         for view in progress_over(views, "texture", "view")
     )
+
+
+def _opaque(view: View) -> np.ndarray | None:
+    """Return the mask [H, W] of the pixels of a photograph that count and are opaque; None: all are."""
+    masks = [] if view.mask is None else [view.mask.read()]
+    if view.has_alpha:
+        masks.append(view.picture.read()[..., 3] == 255)
+    return np.logical_and.reduce(masks) if masks else None
 
 
 def _renders(source: Source, origin: Origin) -> Iterator[Picture]:
