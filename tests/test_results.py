@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import importlib.util
 import json
+import os
 import re
 import shlex
 import sys
@@ -278,6 +279,25 @@ def test_a_folder_of_runs_is_answered_with_the_runs_to_give(tmp_path, capsys):
             )
             assert wanted in capsys.readouterr().err
         assert not (folder / ".a2tg-run").exists()
+
+
+def test_folders_of_other_users_next_to_runs_are_passed_over(tmp_path, capsys, monkeypatch):
+    """Such as lost+found on a disk."""
+    with_record(tmp_path / "a", RunRecord(SceneSource("synthetic"), "a2tg", A2tg()))
+    closed = tmp_path / "lost+found"
+    closed.mkdir()
+    stat = os.stat
+
+    def denied(path, *arguments, **options):
+        if closed in Path(str(path)).parents:
+            raise PermissionError(13, "Permission denied", str(path))
+        return stat(path, *arguments, **options)
+
+    monkeypatch.setattr(os, "stat", denied)
+    assert cli.main(["info", str(tmp_path)]) == 0
+    assert capsys.readouterr().out.startswith("a  a2tg  ")
+    assert cli.main(["render", str(tmp_path)]) == 2
+    assert f"it holds run folders; give one of them: {tmp_path / 'a'}\n" in capsys.readouterr().err
 
 
 def test_info_is_json_on_request(tmp_path, capsys):

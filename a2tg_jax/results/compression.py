@@ -110,7 +110,8 @@ def compress(
     losses = loss_measures(model, scene, opened.settings)
     if not losses:
         raise ValueError(
-            "the model has no cameras to measure a loss with; use save_compact in Python with your own choices"
+            "the model has no cameras to measure a loss with: a2tg convert writes *.a2tgz with the usual bits, and "
+            "save_compact in Python with others"
         )
     measures = list(losses.values())
     num_ways = sum(map(len, ladder.values()))

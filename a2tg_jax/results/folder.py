@@ -256,7 +256,8 @@ def runs_in(folder: Path) -> list[RunFolder]:
     entries = sorted(folder.iterdir()) if folder.is_dir() else []
     runs = []
     for entry in entries:
-        runs += [run for run in (RunFolder(entry), RunFolder(entry / MADE)) if run.record.is_file()]
+        # Unlike Path.is_file, os.path.isfile is False in folders of other users, such as lost+found.
+        runs += [run for run in (RunFolder(entry), RunFolder(entry / MADE)) if os.path.isfile(run.record)]
     return runs
 
 
