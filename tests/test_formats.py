@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from run_folders import create_run
 from small_files import write_archive
-from small_models import assert_same_rule, movable_kernels
+from small_models import assert_same_rule, movable_kernels, with_bands
 from small_values import some_gaussians
 
 from a2tg_jax import (
@@ -168,6 +168,12 @@ def test_what_a_format_does_not_keep():
     assert "spherical harmonics above degree 2" in lost_by(Model(some_gaussians()), Path("a.ksplat"))
     assert lost_by(Model(some_gaussians(), background=(1.0, 1.0, 1.0)), Path("a.ply")) == ["background"]
     assert lost_by(Model(some_gaussians()), Path("a.splat")) == ["spherical harmonics above degree 0", "last digits"]
+    # Where splats differ in degree, the highest counts.
+    dense = some_gaussians()
+    base = Model(dataclasses.replace(dense, sh=dense.sh[:, :1]))
+    banded = with_bands(base, dense.sh[:, 1:], [0, 1, 2, 2, 1, 0, 0])
+    assert lost_by(banded, Path("a.ksplat")) == ["last digits"]
+    assert lost_by(banded, Path("a.splat")) == ["spherical harmonics above degree 0", "last digits"]
     shaped = showing(Appearance(texture=Texture(), exponents=Exponents()))
     assert lost_by(shaped, Path("a.ply")) == ["textures and shapes of kernels (bake turns them into plain splats)"]
     assert lost_by(shaped, Path("a.glb")) == lost_by(shaped, Path("a.a2tgz")) == ["last digits"]

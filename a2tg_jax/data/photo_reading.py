@@ -405,7 +405,8 @@ def read_mask(file: Path, *sizes: tuple[int, int]) -> MaskFile:
     if (width, height) not in sizes:
         wanted = f"{sizes[0][0]}x{sizes[0][1]}"
         raise ValueError(
-            f"{file}: is {width}x{height}, but its photograph is {wanted}; a mask must be of the same size"
+            f"{file}: is {width}x{height}, but its photograph is {wanted}; a mask must be of the same size; a2tg sfm "
+            "takes masks of the photographs by --masks, and undistorts both"
         )
     return MaskFile(counts, has_grey_areas)
 

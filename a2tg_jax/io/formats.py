@@ -212,8 +212,7 @@ def lost_by(model: Model, path: Path) -> list[str]:
             lost.append(bakeable)
         if not shown.is_portable and model.textures is None:
             lost.append(f"what {type(shown).__name__} shows besides Gaussians")
-    # With bands the degree of `sh` is only the one that all splats share.
-    if (model.gaussians.sh_degree if shown.bands is None else 3) > into.highest_degree:
+    if model.live.degrees.max(initial=0) > into.highest_degree:
         lost.append(f"spherical harmonics above degree {into.highest_degree}")
     lost += cut_numbers(into.name, model)
     if not into.keeps_origin:
