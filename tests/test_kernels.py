@@ -266,6 +266,21 @@ def test_mixed_precisions_are_composited_in_the_larger():
     assert_all_close(found, wanted, 0, 2e-2)
 
 
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("compositor", ["native", "xla", "autodiff"])
+def test_shapes_of_kernels_stay_in_float32_among_doubles(compositor):
+    scene = draw_scene(4, num=8)
+    gaussians = as_gaussians(scene, "float32")
+    settings = RenderSettings(compositor=compositor, capacity=2048)
+
+    def loss(shapes):
+        shown = Appearance(exponents=Exponents(shapes))
+        return jnp.sum(render_appearance(gaussians, as_camera(scene, "float32"), shown, settings=settings).color ** 2)
+
+    value, gradient = jax.value_and_grad(loss)(jnp.linspace(-1, 1, 8, dtype=jnp.float32))
+    assert value.dtype == gradient.dtype == jnp.float32 and gradient.any()
+
+
 def test_names_of_kernels_are_the_same_in_every_process_and_others_for_a_class_defined_again():
     """XLA's compilation cache finds them by the name, which contains no address of an object."""
     scene = draw_scene(4, num=8, width=16, height=16)

@@ -6,6 +6,7 @@ each), and spherical harmonics with a degree per Gaussian.
 
 import dataclasses
 import functools
+import math
 from collections.abc import Sequence
 from typing import Any, ClassVar, Literal, NamedTuple, Self
 
@@ -306,8 +307,9 @@ def shapes_of(logarithms: Array) -> Array:
 def curves_of(shapes: Array) -> Curve:
     """Return the curves of shapes s [N], of exponents β = exp(tanh s) in (1/e, e)."""
     exponents = jnp.exp(jnp.tanh(shapes))
-    starts = jnp.exp(exponents * np.log(OFFSET))
-    return Curve(exponents, 1 / (jnp.exp(exponents * np.log(2 + OFFSET)) - starts), starts)
+    # Logarithms of Python: with 64-bit floats on, NumPy's would make float64 of float32.
+    starts = jnp.exp(exponents * math.log(OFFSET))
+    return Curve(exponents, 1 / (jnp.exp(exponents * math.log(2 + OFFSET)) - starts), starts)
 
 
 def falloff_of(curve: Curve, rho: Array) -> Array:

@@ -84,7 +84,7 @@ def _moved(event: Event, gathered: Any, rows: np.ndarray, model: Model) -> Any:
     if jax.tree.structure(new) != jax.tree.structure(moved):  # type: ignore[operator]
         return moved
     # Gaussians that are added between steps take the rows of removed ones.
-    is_removed = jnp.arange(model.num_rows) >= model.live_count
+    is_removed = jnp.arange(model.num_rows, dtype=jnp.int32) >= model.live_count
 
     def renewed(old: Array, initial: Array) -> Array:
         return where_rows(is_removed, initial, old) if old.ndim else old
