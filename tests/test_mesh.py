@@ -333,6 +333,15 @@ def test_one_camera_looks_at_what_it_sees(model):
     assert 0.3 < np.linalg.norm(result.center) < 0.6 and result.mesh.num_faces > 100
 
 
+def test_cameras_that_turn_in_one_place_look_at_what_the_first_sees(model):
+    """Their axes meet in that place up to rounding."""
+    place = np.array([0.7, -1.0, 0.3])
+    turned = [a2tg.look_at(place, [0, 0, height], width=SIDE, height=SIDE, fov=70) for height in (0.0, 0.2, -0.2)]
+    turned += [a2tg.look_at(place, [across, 0, 0], width=SIDE, height=SIDE, fov=70) for across in (0.2, -0.2)]
+    result = a2tg.extract_mesh(model, turned, resolution=60)
+    assert 0.3 < np.linalg.norm(result.center) < 0.6 and result.mesh.num_faces > 100
+
+
 def test_far_splats_do_not_matter_within_the_radius(model):
     means = model.gaussians.means.at[:50].multiply(1e6)
     far = dataclasses.replace(model, gaussians=dataclasses.replace(model.gaussians, means=means))

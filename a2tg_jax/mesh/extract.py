@@ -48,6 +48,8 @@ LONGEST_TRUNCATION = 0.25
 """Largest truncation of a coarser grid, in radii: longer ones would mix both sides of the subject."""
 RADII = 2.0
 """Default radius, in median distances of the cameras from the centre."""
+ONE_PLACE = 1e-6
+"""Largest radius, relative to the distance from the origin, of cameras that are in one place, up to float32."""
 LEAST_WEIGHT = 0.05
 LEAST_TO_FILL = 0.3
 """Larger voxels up to this weight do not fill smaller ones: their surface would be less accurate than none."""
@@ -161,7 +163,7 @@ def extract_mesh(
     renderer = Renderer(model, cameras=cameras, settings=settings)
     depths_of = jax.jit(rendered_depth)
     common_center, common_radius = common_sphere([camera.viewmat for camera in cameras], center)
-    if not common_radius:  # Cameras in one place: the centre is at the median depth of the first.
+    if common_radius <= ONE_PLACE * np.linalg.norm(common_center):  # The centre is at the median depth of the first.
         depth = np.asarray(depths_of(renderer(cameras[0]), cameras[0]).depth)
         has_depth = (depth > 0) & (depth < NOTHING)
         middle = float(np.median(depth[has_depth])) if has_depth.any() else 1.0
