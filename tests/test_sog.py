@@ -21,6 +21,7 @@ from a2tg_jax import Gaussians, Model, load_splats, save_splats
 from a2tg_jax.cli.main import main
 from a2tg_jax.io import sog
 from a2tg_jax.io.formats import files_of
+from a2tg_jax.results.model_source import open_source
 
 SCENE = OTHERS / "scene.sog"
 PICTURES = (
@@ -64,6 +65,7 @@ def test_a_folder_its_header_and_a_zipped_folder_are_read(tmp_path, capsys):
     for path in (folder, folder / "meta.json", tmp_path / "a.sog"):
         found = load_splats(path)
         assert found == wanted
+        assert open_source(path).title == ("a" if path.suffix == ".sog" else "scene")
         assert main(["convert", str(path), str(tmp_path / "b.npz"), "--overwrite"]) == 0
         assert ("zipped without it, are a *.sog" in capsys.readouterr().out) == (path.suffix != ".sog")
         assert load_splats(tmp_path / "b.npz").num == NUM

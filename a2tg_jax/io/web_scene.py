@@ -54,7 +54,8 @@ def encode_web_scene(
     Raises:
       ValueError: if the model has another appearance, too many rows, or a number that is not finite.
     """
-    check_encodable(model.appearance, "a file for browsers")
+    instead = "save_model keeps any model, and a2tg convert --bake makes plain splats of it"
+    check_encodable(model.appearance, "a file for browsers", instead)
     model = checked_live(model)
     # Of the model as `apply_edit` has it.
     marks = {"floaters": scores_of(model)}

@@ -78,7 +78,7 @@ def check_conversion(
         if os.path.realpath(file) in sources:
             whole = "the source" if file == out else f"part of the source and would be written together with {out}"
             raise ValueError(f"{file} is {whole}: choose another name")
-        check_new(file, "OUT", overwrite=overwrite)
+        check_new(file, "name", overwrite=overwrite)
     check_output(out)
 
 

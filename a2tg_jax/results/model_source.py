@@ -27,6 +27,7 @@ from a2tg_jax.data.load import is_scene
 from a2tg_jax.data.other_runs import model_hint
 from a2tg_jax.io.edit_file import apply_edit, load_edit
 from a2tg_jax.io.formats import FORMATS, format_of, load_splats, splats_at
+from a2tg_jax.io.sog import HEADER
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.model import plain_gaussians
 from a2tg_jax.results.commands import first_training_command, resuming_command
@@ -205,7 +206,8 @@ def _source_of_file(path: Path) -> Source:
     notes = [str(warning.message).removeprefix(f"{path}: ") for warning in caught]
     for note in notes:
         warn(f"{path}: {note}")
-    return Source(model, path.stem, ". ".join(notes), path=path)
+    title = path.parent.resolve().name if path.name.lower() == HEADER else path.stem
+    return Source(model, title, ". ".join(notes), path=path)
 
 
 def settings_of(system: System) -> RenderSettings:
