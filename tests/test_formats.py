@@ -235,7 +235,7 @@ def test_files_beside_the_output_are_kept(tmp_path, capsys):
     save_model(tmp_path / "a.npz", Model(some_gaussians()))
     (tmp_path / "b.bin").write_bytes(b"of another")
     assert main(["convert", str(tmp_path / "a.npz"), str(tmp_path / "b.gltf")]) == 2
-    assert "b.bin exists; add --overwrite to replace it, or choose another name" in capsys.readouterr().err
+    assert "b.bin exists; add --overwrite to replace it, or choose another OUT" in capsys.readouterr().err
     assert main(["convert", str(tmp_path / "a.npz"), str(tmp_path / "c.gltf")]) == 0
     (tmp_path / "c.bin").rename(tmp_path / "b.bin")
     (tmp_path / "c.gltf").write_text((tmp_path / "c.gltf").read_text().replace("c.bin", "b.bin"))

@@ -62,8 +62,10 @@ def check_conversion(
     placement: PlacementOptions,
     *,
     overwrite: bool = False,
+    option: str = "OUT",
 ) -> None:
-    """Raise ValueError or OSError unless `out` can be written from a source. Arguments as in `convert`."""
+    """Raise ValueError or OSError unless `out`, named by an option, can be written from a source. Other arguments as in
+    `convert`."""
     writer_of(out)
     if placement.float64 and format_of(out).save is not save_ply:
         raise ValueError(f"`float64` needs an OUT that ends in .ply and is not packed; got {out}")
@@ -78,7 +80,7 @@ def check_conversion(
         if os.path.realpath(file) in sources:
             whole = "the source" if file == out else f"part of the source and would be written together with {out}"
             raise ValueError(f"{file} is {whole}: choose another name")
-        check_new(file, "name", overwrite=overwrite)
+        check_new(file, option, overwrite=overwrite)
     check_output(out)
 
 

@@ -50,7 +50,7 @@ def write_edit(
         check_output(out)
         check_new(out, "`out`", overwrite=overwrite)
     else:
-        check_conversion(source, out, PlacementOptions(), overwrite=overwrite)
+        check_conversion(source, out, PlacementOptions(), overwrite=overwrite, option="`out`")
     opened = open_source(source, name)
     edit = edit_of(options, opened.model)
     subject = find_subject(opened.model) if edit.subject else None

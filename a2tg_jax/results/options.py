@@ -54,7 +54,7 @@ class CompressOptions:
     def check(self) -> None:
         """Raise ValueError, naming the option, if one is invalid."""
         if self.file_budget is not None and self.max_loss is not None:
-            raise ValueError("max_loss and file_budget exclude each other: give one of them")
+            raise ValueError("`max_loss` and `file_budget` exclude each other: give one of them")
         if not 0 <= self.most_loss < math.inf:
             raise ValueError(f"max_loss must be at least 0 dB; got {self.most_loss}")
         if self.tune_iterations < 0:
