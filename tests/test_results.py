@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import errno
 import importlib.util
 import json
 import os
@@ -298,6 +299,21 @@ def test_folders_of_other_users_next_to_runs_are_passed_over(tmp_path, capsys, m
     assert capsys.readouterr().out.startswith("a  a2tg  ")
     assert cli.main(["render", str(tmp_path)]) == 2
     assert f"it holds run folders; give one of them: {tmp_path / 'a'}\n" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EROFS])
+def test_measuring_in_a_folder_that_is_not_writable_asks_for_a_copy(tmp_path, capsys, monkeypatch, number):
+    """Such as a run of another user, or one on a disk that is mounted to be read only."""
+    run = with_record(tmp_path / "run", RunRecord(SceneSource("synthetic"), "a2tg", A2tg()))
+
+    def denied(path, *arguments, **options):
+        raise OSError(number, os.strerror(number), str(path))
+
+    monkeypatch.setattr("a2tg_jax.results.folder.open", denied, raising=False)
+    assert cli.main(["eval", str(run.path)]) == 2
+    assert (
+        f"{run.path} is not writable ({os.strerror(number)}): give a copy of this folder\n" in capsys.readouterr().err
+    )
 
 
 def test_info_is_json_on_request(tmp_path, capsys):

@@ -23,6 +23,7 @@ NAME is a stage's name in the run, such as `a2tg-gaussians` or `a2tg-textures`.
 """
 
 import contextlib
+import errno
 import glob
 import json
 import os
@@ -298,12 +299,18 @@ def claimed(run: RunFolder) -> Iterator[None]:
 
     The operating system locks the marker until the process ends. Some file systems have no locks. Partial files of a
     killed process are removed, and a run that it was replacing is restored. Raises FileExistsError if another process
-    has claimed the folder, and ValueError if the marker is not a run's.
+    has claimed the folder, and ValueError if the folder is not writable or the marker is not a run's.
     """
     run.written()
     run.path.mkdir(parents=True, exist_ok=True)
-    # Append: opening must not empty the marker of a run that another process has claimed.
-    with open(run.marker, "a", encoding="utf-8") as file:
+    with contextlib.ExitStack() as stack:
+        try:
+            # Append: opening must not empty the marker of a run that another process has claimed.
+            file = stack.enter_context(open(run.marker, "a", encoding="utf-8"))
+        except OSError as error:
+            if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+                raise ValueError(f"{run.path} is not writable ({error.strerror}): give a copy of this folder") from None
+            raise
         if not try_lock(file.fileno()):
             raise FileExistsError(
                 f"another process is training or measuring in {run.path}: wait until it ends, or choose another `out`"
