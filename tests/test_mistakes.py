@@ -796,8 +796,9 @@ BY_HAND = shaded(lambda u, v: ((u + v, u, u), v))
 @pytest.mark.long
 def test_a_matrix_product_in_shade_is_composited_by_xla(monkeypatch):
     printed_text = r"the primitive '(stack|broadcast_in_dim)' in Mixed\.shade"
-    with pytest.warns(UserWarning, match=rf"Mixed is composited by XLA, which is slower: .*{printed_text}"):
+    with pytest.warns(UserWarning, match=rf"Mixed is composited by XLA, which is slower: .*{printed_text}") as caught:
         found = drawn(MIXED, "auto")
+    assert caught[0].filename == __file__, "not a line of JAX, which traces"
     by_hand = np.asarray(drawn(MIXED_BY_HAND, "auto"))
     # XLA and the native loops round places on splats differently, where colours rise to 10.
     np.testing.assert_allclose(found, by_hand, rtol=0, atol=3e-6 * np.abs(by_hand).max())

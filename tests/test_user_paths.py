@@ -20,7 +20,7 @@ from a2tg_jax.data.photo_reading import read_depths
 from a2tg_jax.data.ply import read_ply_points
 from a2tg_jax.data.video import extract_frames
 from a2tg_jax.io.formats import FORMATS, format_of
-from a2tg_jax.results.folder import write_json
+from a2tg_jax.results.folder import claimed, write_json
 from a2tg_jax.results.record import read_run_file
 
 
@@ -187,6 +187,12 @@ def test_a_run_writes_into_its_own_folder(tmp_path):
     write_whole(run.own(run.viewer), "page")
     assert (tmp_path / "outside").read_text() == "mine" and not run.report.is_symlink()
     assert run.viewer.is_symlink() and (run.path / "elsewhere.html").read_text() == "page"
+    (tmp_path / "outside").write_text("")
+    run.marker.unlink()
+    run.marker.symlink_to("../outside")
+    with pytest.warns(UserWarning, match=r"was a link to \.\./outside") as caught, claimed(run):
+        pass
+    assert caught[0].filename == __file__, "not a line of contextlib"
 
 
 # Pointers of git-lfs
