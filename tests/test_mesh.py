@@ -495,12 +495,15 @@ def test_pictures_of_a_texture_are_floats_of_their_cameras(sphere):
     pytest.importorskip("xatlas", reason="textures need xatlas: pip install 'a2tg-jax[mesh]'")
     simple = a2tg.simplify_mesh(sphere, 100)
     camera, picture, _ = painted(camera_at(np.array([0.0, -1.2, 0.0])))
-    for given, message in (
-        (np.uint8(255 * picture), "picture must be floats; got uint8"),
-        (picture[::2], "picture must be"),
+    counts = np.ones((camera.height, camera.width), bool)
+    for given, mask, message in (
+        (np.uint8(255 * picture), None, "picture must be floats; got uint8"),
+        (picture[::2], None, r"picture must be \["),
+        (picture, np.repeat(counts, 2, 0), r"mask must be \["),
+        (picture, np.uint8(255 * counts), "mask must be bools; got uint8"),
     ):
         with pytest.raises(ValueError, match=message):
-            a2tg.texture_mesh(simple, [(camera, given, None)], size=64)
+            a2tg.texture_mesh(simple, [(camera, given, mask)], size=64)
 
 
 @pytest.mark.parametrize("suffix", [".glb", ".obj"])

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from a2tg_jax import Camera
-from a2tg_jax.base.checks import check_floats
+from a2tg_jax.base.checks import check_floats, check_mask
 from a2tg_jax.host.optional import optional
 from a2tg_jax.mesh.triangles import Mesh
 
@@ -47,7 +47,8 @@ def texture_mesh(mesh: Mesh, pictures: Iterable[Picture], *, size: int = 2048) -
 
     Raises:
       ValueError: if xatlas is not installed (`pip install 'a2tg-jax[mesh]'`), the size is out of range, a camera has
-        the rays of a lens, or a picture is of another size than its camera or holds no floats.
+        the rays of a lens, a picture or mask is of another size than its camera, a picture holds no floats or a mask no
+        bools.
     """
     mesh, texels = _unwrapped(mesh, size)
     total = np.zeros((len(texels.place), 3), np.float32)
@@ -56,6 +57,8 @@ def texture_mesh(mesh: Mesh, pictures: Iterable[Picture], *, size: int = 2048) -
         if camera.rays is not None:
             raise ValueError("a texture needs pictures of pinhole cameras; got one with the rays of a lens")
         check_floats("picture", picture, (camera.height, camera.width, 3))
+        if mask is not None:
+            check_mask("mask", mask, (camera.height, camera.width))
         depth = draw_view(mesh, camera).depth
         for start in range(0, len(weight), CHUNK):
             part = Texels(*(rows[start : start + CHUNK] for rows in texels))
