@@ -73,6 +73,8 @@ def test_long_first_stages_are_checked_once_after_a_fifth(scene):
         "dB. room for 3 Gaussians: raise it"
     )
     one_colour = np.full((18, 24, 3), 90, np.uint8)
+    empty = dataclasses.replace(scene.train[0], picture=np.zeros_like(one_colour))
+    assert checks_of((empty, *scene.train[1:]), 3.0)[0] == [200], "one empty photograph hides no failure"
     assert checks_of(tuple(dataclasses.replace(view, picture=one_colour) for view in scene.train), 20.0)[0] == []
 
 

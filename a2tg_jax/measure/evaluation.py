@@ -24,12 +24,10 @@ from a2tg_jax.renderer import Renderer
 from a2tg_jax.scene import View, check_are_views, view_image
 from a2tg_jax.texture import Textures
 from a2tg_jax.training.corrections import exposed
-from a2tg_jax.training.reports import flat_psnr, has_learned
+from a2tg_jax.training.reports import ONE_COLOR, flat_psnr, has_learned
 
 NUM_TIMED = 8
 """Views that are timed."""
-ONE_COLOR = 100.0
-"""PSNR of one flat colour in dB from which a photograph is of one colour; rounding leaves 130 or more."""
 
 
 @dataclasses.dataclass(frozen=True)

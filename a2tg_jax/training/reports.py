@@ -170,6 +170,9 @@ LEAST_ITERATIONS = 200
 """Training is not judged earlier than this."""
 NUM_COMPARED = 16
 """Iterations before the check whose PSNR is averaged."""
+ONE_COLOR = 100.0
+"""PSNR of one flat colour in dB from which a photograph is of one colour, such as an empty one; rounding leaves 130 or
+more."""
 NEARLY_FLAT = 40.0
 """PSNR of one flat colour in dB, above which photographs do not show whether a model has learned."""
 ADVICE = (
@@ -201,19 +204,23 @@ class LearningCheck:
             self._seen.append((iteration, psnr))
         if iteration != self._at:
             return
-        reached = float(np.mean([psnr for _, psnr in self._seen]))
+        reached = []
         flat = []
         # Flat colours of the same views, because some are easier than others.
-        for earlier, _ in self._seen:
-            for index in self._order.indices(earlier):
-                view = self._views[index]
-                mask = None if view.mask is None else view.mask.read()
-                flat.append(float(jax.jit(flat_psnr)(view_image(view, (self._level,) * 3), mask)))
-        if not has_learned(reached, float(np.mean(flat))):
+        for earlier, psnr in self._seen:
+            colors = [self._flat_psnr(self._views[index]) for index in self._order.indices(earlier)]
+            if max(colors) < ONE_COLOR:
+                reached.append(psnr)
+                flat.append(np.mean(colors))
+        if reached and not has_learned(float(np.mean(reached)), float(np.mean(flat))):
             warn(
-                f"training does not learn: {reached:.1f} dB on the training views after {self._at:,} iterations, where "
-                f"one flat colour per view reaches {np.mean(flat):.1f} dB. {self._advice}"
+                f"training does not learn: {np.mean(reached):.1f} dB on the training views after {self._at:,} "
+                f"iterations, where one flat colour per view reaches {np.mean(flat):.1f} dB. {self._advice}"
             )
+
+    def _flat_psnr(self, view: View) -> float:
+        mask = None if view.mask is None else view.mask.read()
+        return float(jax.jit(flat_psnr)(view_image(view, (self._level,) * 3), mask))
 
 
 def has_learned(psnr: float, flat: float) -> bool:
