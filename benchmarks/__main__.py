@@ -1,6 +1,6 @@
 """Run all measurements and write them as JSON, with the machine, the versions and the commit.
 
-    python -m benchmarks --out benchmarks/results/cpu.json                     # everything: most of an hour
+    python -m benchmarks --out benchmarks/results/cpu.json                     # everything: a quarter of an hour
     python -m benchmarks --only render --largest 10000                         # a part of it
     python -m benchmarks --scene SCENES/herz_jesus_p25                         # with a real scene
     python -m benchmarks --only others --other 'name=./program --fast'         # another program on the same workload
