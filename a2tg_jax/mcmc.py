@@ -19,7 +19,7 @@ from jax import Array
 from a2tg_jax.base.checks import check_count, check_fields, check_shape
 from a2tg_jax.core.budget import number_to_reach
 from a2tg_jax.core.gaussians import DEAD_OPACITY, MAX_SHARES, Gaussians, check_gaussians, share
-from a2tg_jax.core.numerics import where_rows
+from a2tg_jax.core.numerics import first_rows, where_rows
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.table import bucket_capacity
@@ -139,7 +139,7 @@ DrawHosts = Callable[[Array, Array, Array], Array]
 def plan_relocation(key: Array, opacities: Array, num_live: Array, draw: DrawHosts | None = None) -> Moves:
     """Plan what `relocate` does to rows of these opacities [N], of which the first `num_live` exist. Hosts are drawn by
     `draw`, or with probability ∝ opacity."""
-    is_live = jnp.arange(opacities.shape[0], dtype=jnp.int32) < num_live
+    is_live = first_rows(opacities.shape[0], num_live)
     is_host = is_live & (opacities > DEAD_OPACITY)
     is_dead = is_live & ~is_host
     has_hosts = jnp.any(is_host)
@@ -157,15 +157,15 @@ def plan_growth(
 ) -> Moves:
     """Plan what `grow` does to rows of these opacities [N], of which the first `num_live` exist. It grows to at least
     `least`, within the cap. Hosts are drawn as in `plan_relocation`."""
-    index = jnp.arange(opacities.shape[0], dtype=jnp.int32)
-    is_live = index < num_live
+    num_rows = opacities.shape[0]
+    is_live = first_rows(num_rows, num_live)
     is_host = is_live & (opacities > DEAD_OPACITY)
     has_hosts = jnp.any(is_host)
     # n + ⌊n/20⌋ is ⌊1.05·n⌋ in integers, free of rounding.
     grown = jnp.maximum(jnp.maximum(num_live + 1, num_live + num_live // 20), jnp.asarray(least, jnp.int32))
     grown = jnp.minimum(jnp.asarray(cap, jnp.int32), grown)
     grown = jnp.where(has_hosts, jnp.maximum(grown, num_live), num_live)
-    is_added = ~is_live & (index < grown)
+    is_added = ~is_live & first_rows(num_rows, grown)
     info = MoveInfo(jnp.zeros((), jnp.int32), grown - num_live, has_hosts)
     moves = _copies(key, opacities, is_host, is_added, info, draw)
     return moves._replace(is_reset=moves.is_reset | is_added)
@@ -227,7 +227,7 @@ def perturb(
     transparency = jax.nn.sigmoid(-gaussians.logit_opacities)
     gate = jax.nn.sigmoid(NOISE_STEEPNESS * (transparency - NOISE_TRANSPARENCY))
     strength = gate * (jnp.asarray(lr, dtype) * NOISE_SCALE)
-    is_live = jnp.arange(gaussians.num, dtype=jnp.int32) < jnp.asarray(num_live, jnp.int32)
+    is_live = first_rows(gaussians.num, jnp.asarray(num_live, jnp.int32))
     return dataclasses.replace(gaussians, means=jnp.where(is_live[:, None], means + shift * strength[:, None], means))
 
 

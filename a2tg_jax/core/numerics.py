@@ -47,6 +47,11 @@ def safe_sqrt(x: Array) -> Array:
     return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, x, 1.0)), 0.0)
 
 
+def first_rows(num_rows: int, num: Integer) -> Array:
+    """Return [num_rows] bool, True in the first `num` rows: of a model, those whose Gaussians exist."""
+    return jnp.arange(num_rows, dtype=jnp.int32) < num
+
+
 def where_rows(is_chosen: Array, x: Array, y: Array) -> Array:
     """Return [N, ...] the rows of x that are chosen [N], and the others of y."""
     return jnp.where(is_chosen.reshape(-1, *[1] * (y.ndim - 1)), x, y)

@@ -15,6 +15,7 @@ from jax import Array
 from a2tg_jax.base.checks import check_fields
 from a2tg_jax.core.budget import number_to_reach
 from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.core.numerics import first_rows
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import partition, pytree, static
 from a2tg_jax.events import (
@@ -100,7 +101,7 @@ class CloneSplitPrune(StepEvent):
 
     def plan(self, now: Now, model: Model, gradients: Array) -> tuple[CloneSplitPlan, Array]:
         """Return the plan of each row, given its average gradient, and the number of Gaussians without room."""
-        is_kept = _is_live(model) & ~self._is_pruned(now, model)
+        is_kept = first_rows(model.num_rows, model.live_count) & ~self._is_pruned(now, model)
         # Copies of pruned rows would be pruned as well.
         is_wanted = is_kept & (gradients >= self.threshold)
         room = min(model.num_rows, self.cap) - jnp.sum(is_kept, dtype=jnp.int32)
@@ -138,7 +139,7 @@ class FillingDensity(CloneSplitPrune):
 
     def plan(self, now: Now, model: Model, gradients: Array) -> tuple[CloneSplitPlan, Array]:
         assert now.num_left is not None
-        is_there = _is_live(model)
+        is_there = first_rows(model.num_rows, model.live_count)
         num_live = jnp.sum(is_there, dtype=jnp.int32)
         reached = number_to_reach(num_live, self.cap, now.num_left)
         # An event doubles a Gaussian once at most.
@@ -152,10 +153,6 @@ class FillingDensity(CloneSplitPrune):
         num_doubled = reached - jnp.sum(is_kept, dtype=jnp.int32)
         is_doubled = is_kept & (_ranks(gradients, is_kept) < num_doubled)
         return self._planned(now, model, is_kept, is_doubled), jnp.zeros((), jnp.int32)
-
-
-def _is_live(model: Model) -> Array:
-    return jnp.arange(model.num_rows, dtype=jnp.int32) < model.live_count
 
 
 def _ranks(values: Array, is_ranked: Array) -> Array:

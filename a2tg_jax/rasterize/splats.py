@@ -17,7 +17,7 @@ from a2tg_jax.appearance.base import colors_in_view, cutoff_of, num_colors_of, n
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians
-from a2tg_jax.core.numerics import Integer, factor_to
+from a2tg_jax.core.numerics import Integer, factor_to, first_rows
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.tiles import TileGrid, TileLists
 
@@ -137,7 +137,7 @@ def project_gaussians(
     # Not >=: a NaN depth counts as drawn, so that it is reported.
     is_drawn = ~(M[:, 2, 2] < near_plane)
     if num_live is not None:
-        is_drawn &= jnp.arange(num, dtype=jnp.int32) < num_live
+        is_drawn &= first_rows(num, num_live)
     # A factor on a whole homography moves a splat nearer and changes nothing else; one on two columns makes it smaller.
     nearer = factor_to(LARGEST_DEPTH, [M[:, 2, 2]])
     smaller = nearer * factor_to(LARGEST_AXIS, [M[:, i, k] for i in range(3) for k in range(2)])
@@ -163,7 +163,7 @@ def drawn_splats(
     M, _ = appearance.homographies(gaussians, camera)
     cutoff = cutoff_of(appearance, appearance.peak_opacities(gaussians))
     if num_live is not None:
-        cutoff = jnp.where(jnp.arange(gaussians.num, dtype=jnp.int32) < num_live, cutoff, -1.0)
+        cutoff = jnp.where(first_rows(gaussians.num, num_live), cutoff, -1.0)
     return M, cutoff
 
 

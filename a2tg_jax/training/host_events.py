@@ -4,11 +4,10 @@ import dataclasses
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.core.numerics import where_rows
+from a2tg_jax.core.numerics import first_rows, where_rows
 from a2tg_jax.core.table import map_rows
 from a2tg_jax.events import Due, Event, HostEvent
 from a2tg_jax.model import Model
@@ -84,7 +83,7 @@ def _moved(event: Event, gathered: Any, rows: np.ndarray, model: Model) -> Any:
     if jax.tree.structure(new) != jax.tree.structure(moved):  # type: ignore[operator]
         return moved
     # Gaussians that are added between steps take the rows of removed ones.
-    is_removed = jnp.arange(model.num_rows, dtype=jnp.int32) >= model.live_count
+    is_removed = ~first_rows(model.num_rows, model.live_count)
 
     def renewed(old: Array, initial: Array) -> Array:
         return where_rows(is_removed, initial, old) if old.ndim else old

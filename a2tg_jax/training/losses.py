@@ -12,7 +12,7 @@ from jax import Array
 
 from a2tg_jax.base.checks import check_array, check_floats, check_number, check_shape, plain_array
 from a2tg_jax.core.cameras import Camera, back_project, check_is_camera
-from a2tg_jax.core.numerics import normalize, safe_divide
+from a2tg_jax.core.numerics import first_rows, normalize, safe_divide
 from a2tg_jax.rasterize.kernels import window_scores
 from a2tg_jax.rasterize.kernels.score import Score
 
@@ -143,7 +143,7 @@ def depth_normals(depth: Array, is_valid: Array, camera: Camera) -> tuple[Array,
 
 def live_mean(values: Array, num_live: Array) -> Array:
     """Return the mean of the first `num_live` of N values."""
-    is_live = jnp.arange(values.shape[0], dtype=jnp.int32) < num_live
+    is_live = first_rows(values.shape[0], num_live)
     return jnp.sum(jnp.where(is_live, values, 0.0)) / jnp.maximum(num_live, 1).astype(values.dtype)
 
 
