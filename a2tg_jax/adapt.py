@@ -158,7 +158,8 @@ class Upscale(HostEvent):
         textures = model.textures
         # Only rows that exist can grow.
         num = model.num
-        sizes = textures.sizes[:num]
+        old_sizes = textures.sizes
+        sizes = old_sizes[:num]
         scales = np.asarray(model.gaussians.scales)[:num]
         averages = np.asarray(state.average())[:num]
         proposed = self._proposed(sizes, scales, self.anisotropic, self.cap)
@@ -173,9 +174,8 @@ class Upscale(HostEvent):
         if self.select == "budget" and due.index == due.count and (grown == proposed).all():
             left = rule["budget_bytes"] - _bytes_between(sizes, grown)
             grown = self._grown_within(left, grown, scales, averages)
-        new_sizes = textures.sizes
-        new_sizes[:num] = grown
-        kept = None if self.moments == "copied" else (new_sizes == textures.sizes).all(axis=1)
+        new_sizes = np.concatenate([grown, old_sizes[num:]])
+        kept = None if self.moments == "copied" else (new_sizes == old_sizes).all(axis=1)
         rebuilt = reallocate(textures, new_sizes, moments, tuple(due.layouts), kept, textures.layout)
         due.layouts.add(rebuilt.textures.layout)
         model = model.with_textures(rebuilt.textures)

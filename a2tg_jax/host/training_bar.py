@@ -55,7 +55,8 @@ class ProgressBar(Display):
             self._bar.set_description_str(self._title)
         self._loss += (1 - MOMENTUM) * (loss - self._loss)
         if math.isfinite(psnr):  # An infinite one, of an empty photograph, would stay in the mean.
-            self._psnr += (1 - MOMENTUM if self._psnr else 1) * (psnr - self._psnr)
+            before = self._psnr or psnr
+            self._psnr = before + (1 - MOMENTUM) * (psnr - before)
         self._bar.update(done - self._done)
         self._done = done
         if row and not self._bar.disable:

@@ -125,8 +125,9 @@ def _photographs(source: Source, origin: Origin) -> Iterator[Picture]:
 def _opaque(view: View) -> np.ndarray | None:
     """Return the mask [H, W] of the pixels of a photograph that count and are opaque; None: all are."""
     masks = [] if view.mask is None else [view.mask.read()]
-    if view.has_alpha:
-        masks.append(view.picture.read()[..., 3] == 255)
+    alpha = view.alpha
+    if alpha is not None:
+        masks.append(alpha == 255)
     return np.logical_and.reduce(masks) if masks else None
 
 

@@ -208,10 +208,10 @@ class LearningCheck:
         flat = []
         # Flat colours of the same views, because some are easier than others.
         for earlier, psnr in self._seen:
-            colors = [self._flat_psnr(self._views[index]) for index in self._order.indices(earlier)]
-            if max(colors) < ONE_COLOR:
+            of_views = [self._flat_psnr(self._views[index]) for index in self._order.indices(earlier)]
+            if max(of_views) < ONE_COLOR:
                 reached.append(psnr)
-                flat.append(np.mean(colors))
+                flat.append(np.mean(of_views))
         if reached and not has_learned(float(np.mean(reached)), float(np.mean(flat))):
             warn(
                 f"training does not learn: {np.mean(reached):.1f} dB on the training views after {self._at:,} "
